@@ -1,0 +1,8 @@
+"""A first surface from four boundary polylines."""
+
+from jaxfit._base._base_surface import base_surface as base_surface
+from jaxfit._base._boundary import Boundary as Boundary
+from jaxfit._base._coons import AbstractAbscissae as AbstractAbscissae
+from jaxfit._base._coons import Greville as Greville
+from jaxfit._base._coons import Uniform as Uniform
+from jaxfit._base._coons import coons_surface as coons_surface

@@ -1,0 +1,150 @@
+"""The four boundary polylines of a patch, checked and with common corners."""
+
+from itertools import product
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxfit._checks import as_floating, as_points, is_concrete
+
+# The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
+_CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
+
+
+class Boundary(eqx.Module):
+    """Four polylines around a patch, sharing its corners c00, c10, c11, c01.
+
+        c01 ---- v1 ---> c11
+         ^                ^
+         u0               u1
+         |                |
+        c00 ---- v0 ---> c10
+
+    `v0` and `v1` are the sides v = 0 and v = 1, along which u grows; `u0` and `u1` the sides
+    u = 0 and u = 1, along which v grows.
+
+    Parameters: each polyline (n_i, d) with n_i >= 2 vertices and a common d, any unit, vertices in
+    order. Ends that should meet may differ by `tolerance` (default 1e-6) times the bounding-box
+    diagonal: the u-polyline's end is then moved onto the v-polyline's. Consecutive duplicates
+    are dropped.
+
+    Raises ValueError, naming the polyline, for too few vertices, NaNs, different d, a polyline of
+    length zero (patches with three sides are not supported) and corners that do not meet. A
+    polyline may be closed: opposite corners then coincide, as on a tube. Inside `jit` only
+    shapes are checked and the vertices are taken as they are.
+    """
+
+    v0: Float[Array, "v0_points d"]
+    v1: Float[Array, "v1_points d"]
+    u0: Float[Array, "u0_points d"]
+    u1: Float[Array, "u1_points d"]
+
+    def __init__(
+        self,
+        v0: ArrayLike,
+        v1: ArrayLike,
+        u0: ArrayLike,
+        u1: ArrayLike,
+        tolerance: float = 1e-6,
+    ):
+        given = {"v0": v0, "v1": v1, "u0": u0, "u1": u1}
+        lines = {name: as_points(name, x, least=2) for name, x in given.items()}
+        for name, line in lines.items():
+            if line.shape[1] != lines["v0"].shape[1]:
+                raise ValueError(
+                    f"{name} has {line.shape[1]} coordinates a vertex and v0 has "
+                    f"{lines['v0'].shape[1]}; give all four polylines in one space."
+                )
+        dtype = jnp.result_type(*lines.values())
+        if is_concrete(lines):
+            # Into the final dtype first: rounding may create duplicates and part the corners.
+            arrays = {name: np.array(x, dtype=dtype) for name, x in lines.items()}
+            lines = _cleaned(arrays, tolerance)
+        self.v0, self.v1, self.u0, self.u1 = (jnp.asarray(x, dtype) for x in lines.values())
+
+    @classmethod
+    def from_grid(cls, grid: ArrayLike) -> "Boundary":
+        """The four edges of grid data (n, m, d), u along the first index, v along the second."""
+        data = as_floating("grid", grid, 3)
+        if data.shape[0] < 2 or data.shape[1] < 2:
+            raise ValueError(
+                f"grid must hold at least 2 x 2 points, but has shape {data.shape}; give an "
+                "array (n, m, d)."
+            )
+        return cls(v0=data[:, 0], v1=data[:, -1], u0=data[0], u1=data[-1])
+
+
+def diagonal(*sets: np.ndarray) -> float:
+    """Bounding-box diagonal of all the points together."""
+    low, high = _box(sets)
+    return float(np.linalg.norm(high - low))
+
+
+def middle(*sets: np.ndarray) -> np.ndarray:
+    """Middle of the bounding box of all the points together."""
+    low, high = _box(sets)
+    return low + (high - low) / 2
+
+
+def _box(sets: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
+    low = np.min([np.min(x, axis=0) for x in sets], axis=0)
+    high = np.max([np.max(x, axis=0) for x in sets], axis=0)
+    return low.astype(float), high.astype(float)
+
+
+def _cleaned(lines: dict[str, np.ndarray], tolerance: float) -> dict[str, np.ndarray]:
+    magnitude = max(float(np.abs(x).max()) for x in lines.values())
+    eps = float(jnp.finfo(lines["v0"].dtype).eps)
+    rounding, size = 4 * eps * magnitude, diagonal(*lines.values())
+    for name, line in lines.items():
+        if diagonal(line) <= rounding:
+            raise ValueError(
+                f"{name} has length zero; patches with three sides are not supported, so cut "
+                "the tip off or give a polyline of distinct points."
+            )
+    _check_corners(lines, max(tolerance * size, rounding), size)
+    for v, v_end, u, u_end in _CORNERS:
+        lines[u][u_end] = lines[v][v_end]
+    return {name: _without_repeats(line, 4 * eps * size) for name, line in lines.items()}
+
+
+def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
+    steps = np.linalg.norm(np.diff(line.astype(float), axis=0), axis=1)
+    kept = line[np.concatenate([[True], steps > least])]
+    if len(kept) < 2:
+        return line[[0, -1]]
+    kept[-1] = line[-1]  # the corner stays, whichever of its copies went
+    return kept
+
+
+def _gaps(lines: dict[str, np.ndarray]) -> list[float]:
+    ends = [
+        lines[v][v_end].astype(float) - lines[u][u_end].astype(float)
+        for v, v_end, u, u_end in _CORNERS
+    ]
+    return [float(np.linalg.norm(x)) for x in ends]
+
+
+def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) -> None:
+    gaps = _gaps(lines)
+    worst = int(np.argmax(gaps))
+    if gaps[worst] <= allowed:
+        return
+    v, v_end, u, u_end = _CORNERS[worst]
+    raise ValueError(
+        f"boundary corners do not meet: the {'start' if v_end == 0 else 'end'} of {v} and the "
+        f"{'start' if u_end == 0 else 'end'} of {u} are {gaps[worst]:.3g} apart "
+        f"({100 * gaps[worst] / size:.2g} % of the diagonal); {_remedy(lines, allowed)}."
+    )
+
+
+def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
+    for flips in sorted(product((1, -1), repeat=4), reverse=True):
+        turned = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
+        if max(_gaps(turned)) <= allowed:
+            names = [n for n, f in zip(lines, flips, strict=True) if f < 0]
+            return f"reverse {' and '.join(names)}"
+    return "make the polylines share their corner points"

@@ -1,0 +1,23 @@
+"""A wall between parts of a computation that XLA may not fuse through."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+def staged(always: Array, function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)`, computed once and stored.
+
+    XLA's CPU compiler copies an expression into each of its uses, which multiplies the work where one
+    large expression has many; an optimisation barrier is dropped before that happens. A branch on a value
+    known only at run time is a wall that stays. `always` is that value: true, but not provably so.
+    """
+    shapes = jax.eval_shape(function, *args)
+
+    def never(*_: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    return lax.cond(always, function, never, *args)

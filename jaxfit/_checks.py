@@ -1,0 +1,107 @@
+"""Checks of what users hand in: one sentence each, before anything is compiled."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+
+def is_concrete(*trees: Any) -> bool:
+    """Whether no leaf of `trees` is a tracer, so that values may be looked at."""
+    return not any(isinstance(x, jax.core.Tracer) for x in jax.tree_util.tree_leaves(trees))
+
+
+def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
+    """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
+    if not isinstance(x, (np.ndarray, jax.Array)):
+        try:
+            x = np.asarray(x)
+        except ValueError as error:
+            raise ValueError(
+                f"{name} must be a rectangular array of numbers, but its rows differ in length; "
+                "make them equal."
+            ) from error
+    if x.dtype.kind not in "fiub" and not jnp.issubdtype(x.dtype, jnp.floating):
+        raise TypeError(
+            f"{name} must hold real numbers, but has dtype {x.dtype}; convert it to floats."
+        )
+    if x.ndim != ndim:
+        raise ValueError(
+            f"{name} must have {ndim} dimension{'s' * (ndim != 1)}, but has shape {x.shape}; "
+            "reshape it."
+        )
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        x = x.astype(np.float64 if isinstance(x, np.ndarray) else jnp.result_type(float))
+    if is_concrete(x) and x.size:
+        check_finite(name, x)
+    return x
+
+
+def check_finite(name: str, x: ArrayLike) -> None:
+    """Raise unless every entry of the concrete array `x` is finite."""
+    values = np.asarray(x)
+    if np.isfinite(values).all():
+        return
+    bad = ~np.isfinite(values)
+    first = tuple(int(i) for i in np.argwhere(bad)[0])
+    where = first[0] if len(first) == 1 else first
+    raise ValueError(
+        f"{name} must be finite, but {int(bad.sum())} of its {values.size} entries are NaN or "
+        f"infinite, the first at index {where}; remove or repair them."
+    )
+
+
+def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int = 1) -> Any:
+    """`x` as a floating array (points, d) of at least `least` points."""
+    x = as_floating(name, x, 2)
+    if dimension is not None and x.shape[1] != dimension:
+        raise ValueError(
+            f"{name} must have {dimension} coordinates a row, but has {x.shape[1]}; "
+            "give one row per point."
+        )
+    if x.shape[1] < 1 or x.shape[0] < least:
+        raise ValueError(
+            f"{name} must hold at least {least} point{'s' * (least != 1)}, but has shape "
+            f"{x.shape}; give more points."
+        )
+    return x
+
+
+def check_knots(name: str, knots: ArrayLike, order: int, count: int) -> None:
+    """Raise unless `knots` is a knot vector for `count` control points of this order."""
+    if np.ndim(knots) != 1 or np.shape(knots)[0] != count + order:
+        raise ValueError(
+            f"{name} must hold {count + order} knots ({count} control points + order {order}), "
+            f"but has shape {np.shape(knots)}; give one knot vector of that length."
+        )
+    if not is_concrete(knots):
+        return
+    values = np.asarray(knots)
+    check_finite(name, values)
+    falls = np.flatnonzero(np.diff(values) < 0)
+    if falls.size:
+        i = int(falls[0])
+        raise ValueError(
+            f"{name} must not decrease, but {name}[{i + 1}] = {values[i + 1]:g} comes after "
+            f"{values[i]:g}; sort the knots."
+        )
+    if not values[order - 1] < values[count]:
+        raise ValueError(
+            f"{name} must span a domain, but its ends {values[order - 1]:g} and "
+            f"{values[count]:g} coincide; spread the knots."
+        )
+    _check_multiplicity(name, values, order, count)
+
+
+def _check_multiplicity(name: str, knots: np.ndarray, order: int, count: int) -> None:
+    # Extra repeats of the end knots are harmless (they pad nets of fixed capacity).
+    inside = (knots > knots[order - 1]) & (knots < knots[count])
+    values, repeats = np.unique(knots[inside], return_counts=True)
+    if repeats.size and repeats.max() > order:
+        i = int(np.argmax(repeats))
+        raise ValueError(
+            f"{name} must repeat no interior knot more than {order} times (the order), but "
+            f"{values[i]:g} appears {repeats[i]} times; remove the surplus."
+        )

@@ -1,0 +1,106 @@
+"""The arguments of the command `jaxfit`, and its help."""
+
+import argparse
+import math
+import re
+from typing import NoReturn
+
+from jaxfit import __version__
+from jaxfit.io import InputError
+
+_DESCRIPTION = """\
+Fit a B-spline surface to INPUT and write it to OUTPUT.
+
+INPUT   .npz  'grid' (n, m, 3), or 'points' (N, 3) with 'boundary_v0', 'boundary_v1',
+              'boundary_u0', 'boundary_u1' (polylines)
+        .npy  (n, m, 3) grid or (N, 3) scattered points
+        .csv .xyz .txt  scattered points, one x y z a line
+        jacksboro       the terrain inside Matplotlib
+OUTPUT  .npz  control_points, knots_u, knots_v, order
+        .json geomdl's exchange format
+"""
+_EPILOG = """\
+exit codes:
+  0  fitted and written
+  1  written, but the requested tolerance was not reached
+  2  bad input or usage, or a file cannot be written
+  3  the fit failed numerically, nothing is written
+
+All errors are distances from the data to the surface, in % of the diagonal of the data's
+bounding box.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; see {self.prog} --help.")
+
+
+def argument_parser() -> argparse.ArgumentParser:
+    """The parser of `jaxfit`; what it cannot read raises `InputError`."""
+    parser = _Parser(prog="jaxfit", description="B-spline surfaces through points, in JAX.")
+    parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    fit = commands.add_parser(
+        "fit",
+        help="fit a surface to a file of points",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    fit.add_argument("input", metavar="INPUT", help="the points, see above")
+    fit.add_argument("-o", "--output", metavar="OUTPUT", required=True, help="the surface")
+    fit.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
+    fit.add_argument(
+        "--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)"
+    )
+    fit.add_argument(
+        "--method",
+        choices=("auto", "interpolate", "approximate"),
+        default="auto",
+        help="auto interpolates grids of up to 40,000 points unless --net is given, and "
+        "approximates everything else",
+    )
+    fit.add_argument(
+        "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
+    )
+    fit.add_argument("--boundary", metavar="FILE", help=".npz with the four border polylines")
+    for which in ("average", "maximum"):
+        fit.add_argument(
+            f"--tol-{which}",
+            type=_percent,
+            metavar="PCT",
+            help=f"stop at this {which} error, in %%",
+        )
+    fit.add_argument("--max-steps", type=_count, metavar="N", help="stop after this many steps")
+    picture = fit.add_mutually_exclusive_group()
+    picture.add_argument(
+        "--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)"
+    )
+    picture.add_argument("--no-picture", action="store_true", help="draw nothing")
+    fit.add_argument("--float32", action="store_true", help="single precision")
+    fit.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    return parser
+
+
+def _pair(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is no pair of counts such as 62x57")
+    return int(match[1]), int(match[2])
+
+
+def _percent(text: str) -> float:
+    try:
+        value = float(text.removesuffix("%"))
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no percentage such as 0.02")
+    return value
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of steps such as 100")
+    return int(text)

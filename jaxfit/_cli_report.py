@@ -1,0 +1,51 @@
+"""What the command line shows: a table and a progress bar, plain text where rich is missing."""
+
+import contextlib
+import importlib.util
+from collections.abc import Callable, Iterator, Mapping
+
+Progress = Callable[[int, int, float, float], None]
+
+
+def print_table(rows: Mapping[str, str]) -> None:
+    """Print names and values in two columns on stdout."""
+    if importlib.util.find_spec("rich") is None:
+        width = max(map(len, rows))
+        for name, value in rows.items():
+            print(f"{name:<{width}}  {value}")
+        return
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows.items():
+        table.add_row(name, Text(value))  # no markup: file names may hold brackets
+    Console().print(table)
+
+
+@contextlib.contextmanager
+def progress_bar(show: bool) -> Iterator[Progress | None]:
+    """A bar on stderr while the block runs; yields what a fit takes as `progress`, or None."""
+    if not show or importlib.util.find_spec("rich") is None:
+        yield None
+        return
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("fitting"),
+        progress.BarColumn(),
+        progress.TextColumn("{task.completed}/{task.total}  {task.fields[errors]}"),
+        progress.TimeElapsedColumn(),
+    )
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None, errors="")
+
+        def report(step: int, max_steps: int, average: float, maximum: float) -> None:
+            errors = f"average {100 * float(average):.4g} %, maximum {100 * float(maximum):.4g} %"
+            bar.update(task, completed=int(step), total=int(max_steps), errors=errors)
+
+        yield report

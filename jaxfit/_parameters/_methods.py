@@ -1,0 +1,32 @@
+"""How the distance between neighbouring points becomes a step of the parameter."""
+
+from typing import ClassVar
+
+import equinox as eqx
+
+
+class AbstractParametrisation(eqx.Module):
+    """Steps of the parameter proportional to a power of the distance between neighbours.
+
+    `exponent` is that power; the two final classes are `ChordLength` and `Centripetal`.
+    """
+
+    exponent: eqx.AbstractClassVar[float]
+
+
+class ChordLength(AbstractParametrisation):
+    """Steps proportional to the distance itself: close to arc length on well sampled data.
+
+    Source: paper section 2.2; NURBS Book eq. 9.5.
+    """
+
+    exponent: ClassVar[float] = 1.0
+
+
+class Centripetal(AbstractParametrisation):
+    """Steps proportional to the square root of the distance: calmer where spacing jumps.
+
+    Source: paper section 2.2; E. T. Y. Lee, CAD 21 (1989); NURBS Book eq. 9.6.
+    """
+
+    exponent: ClassVar[float] = 0.5

@@ -1,0 +1,40 @@
+"""What a tolerance asks of the working precision, said once."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+
+# Relative to the extent of the data: what feet reach without trouble in each precision.
+DEFAULT_FOOT_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
+_said = False
+
+
+def working_dtype() -> np.dtype:
+    """The floating type that arrays get: float64 if the session has x64 switched on."""
+    return np.dtype(jnp.result_type(float))
+
+
+def default_foot_tolerance(dtype: np.dtype) -> float:
+    """Tolerance for foot points, as a fraction of the extent."""
+    return DEFAULT_FOOT_TOLERANCE.get(np.dtype(dtype).name, 1e-5)
+
+
+def advise_x64(tolerance: float, dtype: np.dtype) -> None:
+    """Tell the user, once a session, that a tolerance is out of reach in this precision."""
+    global _said
+    if _said or np.dtype(dtype).itemsize >= 8 or tolerance >= 1e-6:
+        return
+    _said = True
+    warnings.warn(
+        f"the tolerance {tolerance:g} is beyond {np.dtype(dtype).name}; switch on "
+        'double precision with jax.config.update("jax_enable_x64", True).',
+        stacklevel=3,
+    )
+
+
+def bucket(count: int, least: int = 64) -> int:
+    """The next of eight sizes an octave, so that nearby sizes share one compilation."""
+    count = max(count, least)
+    step = 1 << max(count.bit_length() - 4, 0)
+    return -(-count // step) * step

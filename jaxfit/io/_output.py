@@ -1,0 +1,65 @@
+"""Files appear whole or not at all."""
+
+import os
+from pathlib import Path
+
+from jaxfit.io._point_data import InputError
+
+
+def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = (".npz", ".json")) -> None:
+    """Raise now if `path` cannot be written later, before a long fit is spent on it.
+
+    Parameters
+    ----------
+    path
+        The file to be written. An existing file is left alone here and replaced later.
+    suffixes
+        The formats that can be written.
+
+    Raises
+    ------
+    InputError
+        For an unknown suffix, a missing folder, a folder in place of a file, and a folder in
+        which no file can be made.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in suffixes:
+        raise InputError(
+            f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, so "
+            f"its format is not known; use one of {', '.join(suffixes)}."
+        )
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file in it.")
+    part = _part(path)
+    if not part.parent.is_dir():
+        raise InputError(f"the folder {part.parent} does not exist; make it first.")
+    try:
+        # Permission bits say too little (an administrator ignores them), so try.
+        part.touch()
+        part.unlink()
+    except OSError as error:
+        raise InputError(
+            f"no file can be written in the folder {part.parent}: {error.strerror or error}."
+        ) from error
+
+
+def write_atomically(path: str | os.PathLike, content: bytes) -> None:
+    """Write `content` to a neighbour of `path`, then put it in its place in one step.
+
+    Raises
+    ------
+    OSError
+        If that fails; an existing file is then left as it was, and no part stays behind.
+    """
+    part = _part(Path(path))
+    try:
+        part.write_bytes(content)
+        os.replace(part, os.path.realpath(path))
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _part(path: Path) -> Path:
+    # Beside the target of a link, not beside the link: only there replacing is one step.
+    target = Path(os.path.realpath(path))
+    return target.with_name(f".{target.name}.{os.getpid()}.part")

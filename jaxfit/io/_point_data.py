@@ -1,0 +1,75 @@
+"""What a file of points holds, and the error that says what is wrong with it."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._base import Boundary
+
+
+class InputError(ValueError):
+    """A file cannot be used; the message is one sentence that names it and says what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PointData:
+    """Data points as read from a file: scattered `points`, or a `grid`, never both.
+
+    Parameters
+    ----------
+    points
+        Scattered points, float64, in file order; None for a grid.
+    grid
+        Points in rows and columns, float64: the first index runs along u, the second along v;
+        None for scattered points.
+    boundary
+        The four border polylines: as stored beside scattered points, or the edges of a grid
+        (None where the edges make no boundary, for instance because one of them is a single
+        point). None when nothing is known about the border.
+    name
+        Short name for tables and titles: the file's name without folder and suffix.
+    """
+
+    points: Float[np.ndarray, "points 3"] | None
+    grid: Float[np.ndarray, "n m 3"] | None
+    boundary: Boundary | None
+    name: str
+
+    @property
+    def cloud(self) -> Float[np.ndarray, "points 3"]:
+        """All points one after another, whether or not they make a grid (row by row)."""
+        if self.points is not None:
+            return self.points
+        assert self.grid is not None
+        return self.grid.reshape(-1, 3)
+
+    def as_grid(self, n: int, m: int) -> "PointData":
+        """The same points read as a grid of `n` by `m`, the second index running fastest.
+
+        Raises
+        ------
+        InputError
+            If there are not n * m points.
+        """
+        cloud = self.cloud
+        if len(cloud) != n * m:
+            raise InputError(
+                f"{self.name} holds {len(cloud)} points, which do not make a {n} x {m} grid of "
+                f"{n * m}; give the grid's true size."
+            )
+        return grid_data(cloud.reshape(n, m, 3), self.name)
+
+
+def grid_data(grid: Float[np.ndarray, "n m 3"], name: str, path: object = None) -> PointData:
+    """A grid, its four edges as the boundary where they make one; errors name the `path`."""
+    if min(grid.shape[:2]) < 2:
+        raise InputError(
+            f"{path or name} holds a grid of {grid.shape[0]} x {grid.shape[1]} points, which "
+            "spans no surface; give at least two rows and two columns."
+        )
+    try:
+        boundary = Boundary.from_grid(grid)
+    except ValueError:
+        boundary = None
+    return PointData(None, grid, boundary, name)

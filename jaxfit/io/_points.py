@@ -1,0 +1,179 @@
+"""`read_points`: one function for every file of points, chosen by suffix."""
+
+import dataclasses
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._base import Boundary
+from jaxfit.io._point_data import InputError, PointData, grid_data
+from jaxfit.io._text import read_columns
+
+BOUNDARY_KEYS = ("boundary_v0", "boundary_v1", "boundary_u0", "boundary_u1")
+_KEYS = ("grid", "points", *BOUNDARY_KEYS)
+SUFFIXES = (".npz", ".npy", ".csv", ".xyz", ".txt")
+_LEAST_POINTS = 4
+
+
+def read_points(path: str | os.PathLike) -> PointData:
+    """Read scattered points or a grid, and the border if the file holds one.
+
+    ==================  ===========================================================
+    suffix              content
+    ==================  ===========================================================
+    ``.npz``            ``grid`` (n, m, 3), or ``points`` (N, 3) with or without
+                        ``boundary_v0``, ``boundary_v1``, ``boundary_u0``,
+                        ``boundary_u1`` (see `jaxfit.Boundary`); other keys are
+                        ignored, and so are ``points`` beside a ``grid``
+    ``.npy``            one array, (N, 3) scattered or (n, m, 3) grid
+    ``.csv``            scattered, one point a line, commas; a first line of names
+                        is skipped
+    ``.xyz``, ``.txt``  the same with blanks instead of commas
+    ==================  ===========================================================
+
+    Columns after the third are ignored everywhere, blank lines and lines that begin with ``#``
+    in text files. Coordinates become float64.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    PointData
+
+    Raises
+    ------
+    InputError
+        For a missing or unreadable file, an unknown suffix, arrays of the wrong shape, text that
+        holds no numbers, NaN or infinite coordinates, fewer than four points, and a boundary
+        that is incomplete or whose corners do not meet.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    check_input(path, SUFFIXES)
+    if suffix in (".csv", ".xyz", ".txt"):
+        return _from_array(read_columns(path), "points", path)
+    arrays, names = _load(path)
+    if suffix == ".npy" and "array" in arrays:
+        array = arrays["array"]
+        return _from_array(array, "grid" if array.ndim == 3 else "points", path)
+    if "grid" in arrays:
+        return _from_array(arrays["grid"], "grid", path)
+    if "points" in arrays:
+        data = _from_array(arrays["points"], "points", path)
+        return dataclasses.replace(data, boundary=_boundary(arrays, path))
+    raise InputError(
+        f"{path} holds neither a grid nor points, but {', '.join(names[:5]) or 'nothing'}; store "
+        "an array 'grid' of shape (n, m, 3) or 'points' of shape (N, 3)."
+    )
+
+
+def read_boundary(path: str | os.PathLike) -> Boundary:
+    """The four border polylines in the keys ``boundary_*`` of an .npz file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a polyline is missing, or their corners do not meet.
+    """
+    path = Path(path)
+    check_input(path, (".npz",))
+    boundary = _boundary(_load(path)[0], path)
+    if boundary is None:
+        raise InputError(f"{path} holds no boundary; store {', '.join(BOUNDARY_KEYS)} in it.")
+    return boundary
+
+
+def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Raise unless `path` is a file that is not empty and has one of these suffixes."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file in it.")
+    if not path.exists():
+        raise InputError(f"{path} does not exist; check its name and folder.")
+    if path.suffix.lower() not in suffixes:
+        raise InputError(
+            f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, "
+            f"which says too little about what is in it; use one of {', '.join(suffixes)}."
+        )
+    if path.stat().st_size == 0:
+        raise InputError(f"{path} is empty; write it again.")
+
+
+def _load(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The known arrays of an .npz file (an .npy file's only one as 'array'), and all names."""
+    try:
+        with open(path, "rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if isinstance(loaded, np.ndarray):
+                return {"array": loaded}, ["one array without a name"]
+            # Other keys may hold anything, so they are not read.
+            return {key: loaded[key] for key in loaded.files if key in _KEYS}, loaded.files
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"{path} is damaged, or holds something else than plain NumPy arrays of numbers; "
+            "write it again with NumPy."
+        ) from error
+
+
+def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
+    shape, ndim = ("(n, m, 3)", 3) if key == "grid" else ("(N, 3)", 2)
+    array = _coordinates(array, key, ndim, shape, path)
+    if array.size < 3 * _LEAST_POINTS:
+        raise InputError(
+            f"{path} holds {array.size // 3} point{'s' * (array.size != 3)}, but a surface needs "
+            f"at least {_LEAST_POINTS}; give more."
+        )
+    if key == "grid":
+        return grid_data(array, path.stem, path)
+    return PointData(array, None, None, path.stem)
+
+
+def _coordinates(
+    array: np.ndarray, key: str, ndim: int, shape: str, path: Path
+) -> Float[np.ndarray, "... 3"]:
+    """The first three columns as finite float64."""
+    if array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: {key} has dtype {array.dtype}; store the coordinates as real numbers."
+        )
+    if array.ndim != ndim or array.shape[-1] < 3:
+        raise InputError(f"{path}: {key} has shape {array.shape}; it must be {shape}.")
+    array = np.ascontiguousarray(array[..., :3], dtype=np.float64)
+    good = np.isfinite(array).all(axis=-1)
+    if not good.all():
+        first = np.argwhere(~good)[0]
+        raise InputError(
+            f"{path}: {int((~good).sum())} of {good.size} points in {key} have NaN or infinite "
+            f"coordinates, the first at index {', '.join(str(int(i)) for i in first)}; remove or "
+            "repair them."
+        )
+    return array
+
+
+def _boundary(arrays: Mapping[str, np.ndarray], path: Path) -> Boundary | None:
+    missing = [key for key in BOUNDARY_KEYS if key not in arrays]
+    if len(missing) == len(BOUNDARY_KEYS):
+        return None
+    if missing:
+        raise InputError(
+            f"{path} holds an incomplete boundary without {', '.join(missing)}; store all four "
+            "polylines or none."
+        )
+    sides: dict[str, Any] = {
+        key.removeprefix("boundary_"): _coordinates(arrays[key], key, 2, "(n, 3)", path)
+        for key in BOUNDARY_KEYS
+    }
+    try:
+        return Boundary(**sides)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error

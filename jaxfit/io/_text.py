@@ -1,0 +1,76 @@
+"""Columns of numbers in text files, with the line number of whatever is no number."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit.io._point_data import InputError
+
+
+def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
+    """The first three columns of a text file: commas for .csv, blanks otherwise.
+
+    Raises
+    ------
+    InputError
+        With the line number, for anything that is not a finite number.
+    """
+    delimiter = "," if path.suffix.lower() == ".csv" else None
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} holds no plain text; save it as text in UTF-8.") from error
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if (stripped := line.strip()) and not stripped.startswith("#")
+    ]
+    if lines and _is_header(lines[0][1]):
+        lines = lines[1:]
+    if not lines:
+        raise InputError(f"{path} holds no points; write one point a line.")
+    try:
+        values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=(0, 1, 2))
+    except ValueError as error:
+        raise InputError(_explain(path, lines, delimiter)) from error
+    values = values.reshape(-1, 3)
+    good = np.isfinite(values).all(axis=1)
+    if not good.all():
+        raise InputError(
+            f"{path}: {int((~good).sum())} of {len(values)} points have NaN or infinite "
+            f"coordinates, the first in line {lines[int(np.argmin(good))][0]}; remove or repair "
+            "them."
+        )
+    return values
+
+
+def _is_header(line: str) -> bool:
+    return not any(_is_number(cell) for cell in re.split(r"[,;\s]+", line))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _explain(path: Path, lines: list[tuple[int, str]], delimiter: str | None) -> str:
+    """The sentence for the first line that cannot be read (NumPy counts other lines)."""
+    for number, line in lines:
+        cells = line.split("#")[0].split(delimiter)
+        if len(cells) < 3:
+            hint = "commas" if delimiter else "blanks"
+            return (
+                f"{path}: line {number} has {len(cells)} column{'s' * (len(cells) != 1)}, but a "
+                f"point has three; separate x, y and z by {hint}."
+            )
+        for cell in cells[:3]:
+            if not _is_number(cell):
+                return f"{path}: line {number} has {cell.strip()!r} in place of a number; mend it."
+    return f"{path} is not a table of numbers; write one point a line."

@@ -1,0 +1,173 @@
+"""`surface_and_errors`: the fitted surface beside its errors."""
+
+import io
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit.io._output import write_atomically
+from jaxfit.plot._render import render
+from jaxfit.plot._view import View
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_LARGEST_SCATTER = 20_000  # points; more are drawn as a raster
+_COLOURS = "inferno"
+
+
+def surface_and_errors(
+    fit: Any,
+    points: ArrayLike | None = None,
+    path: str | os.PathLike | None = None,
+    title: str = "",
+    dpi: int = 150,
+) -> "Figure":
+    """One picture: on the left the surface, on the right its distance from every data point.
+
+    The surface is shaded and carries some of its knot lines. A flat one (terrain) is stretched
+    along its short axis, and the caption says by how much. Errors are coloured in % of the
+    diagonal of the data's bounding box, over the parameters (u, v) of the points, or over the
+    rows and columns of a grid; colours end at the 99.5th percentile, so that a few outliers do
+    not hide the rest. Of more than 20,000 scattered points every cell of a raster shows its
+    largest error. Neither pyplot nor a backend is touched.
+
+    Parameters
+    ----------
+    fit
+        What `jaxfit.interpolate`, `jaxfit.approximate` or `jaxfit.fit_points` returned.
+    points
+        The data. Needed only for a grid (n, m, d) that was fitted as scattered points, row by
+        row: its errors are then drawn in rows and columns.
+    path
+        Where to save the picture (.png, .pdf, .svg, ...); None saves nothing.
+    title
+        Heading, for instance the name of the data.
+    dpi
+        Pixels per inch; the picture is 12 x 5.2 inches.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ImportError
+        If Matplotlib is not installed.
+    ValueError
+        If `points` is a grid whose size is not the number of errors.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(
+            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+        ) from error
+    errors = _arrange(fit.errors, points)
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
+    view = _draw_surface(left, fit.surface)
+    _draw_errors(right, fit, 100 * errors, view)
+    if title:
+        figure.suptitle(title, fontsize=14, fontweight="bold")
+    if path is not None:
+        _save(figure, Path(path), dpi)
+    return figure
+
+
+def _arrange(errors: ArrayLike, points: ArrayLike | None) -> np.ndarray:
+    errors = np.asarray(errors, dtype=float)
+    if points is None or np.ndim(points) != 3 or errors.ndim == 2:
+        return errors
+    shape = np.shape(points)[:2]
+    if errors.size != shape[0] * shape[1]:
+        raise ValueError(
+            f"points is a grid of {shape[0]} x {shape[1]}, but the fit has {errors.size} errors; "
+            "give the points that were fitted."
+        )
+    return errors.reshape(shape)
+
+
+def _draw_surface(axes: "Axes", surface: Any) -> View:
+    image, view = render(surface)
+    axes.imshow(image)
+    axes.set_axis_off()
+    nu, nv = surface.shape
+    caption = f"{nu} \N{MULTIPLICATION SIGN} {nv} control points"
+    if view.factor > 1:
+        caption += f", {view.relief} stretched {view.factor} times"
+    axes.set_title(caption, fontsize=11)
+    return view
+
+
+def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None:
+    top = float(np.percentile(errors, 99.5)) or 1.0
+    drawn: Any
+    style: dict[str, Any] = {"cmap": _COLOURS, "vmin": 0.0, "vmax": top}
+    label = "error, % of the diagonal"
+    u, v = (np.asarray(x, dtype=float).ravel() for x in (fit.u, fit.v))
+    if errors.ndim == 2:
+        drawn = axes.imshow(errors.T, origin="lower", aspect="auto", **style)
+        axes.set_xlabel("row of the grid (along u)")
+        axes.set_ylabel("column of the grid (along v)")
+    else:
+        axes.set_facecolor("0.92")
+        axes.set_xlabel("u")
+        axes.set_ylabel("v")
+        if errors.size > _LARGEST_SCATTER:
+            raster, edges_u, edges_v = _largest_per_cell(u, v, errors)
+            drawn = axes.pcolormesh(edges_u, edges_v, raster.T, **style)
+            label = "largest error per cell, % of the diagonal"
+        else:
+            size = np.clip(7e4 / errors.size, 1.5, 60.0)
+            drawn = axes.scatter(u, v, c=errors, s=size, linewidths=0, **style)
+        axes.margins(0.02)
+    _turn_like_the_surface(axes, fit.surface, view)
+    bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02)
+    bar.set_label(label)
+    axes.set_title(
+        f"average {100 * float(fit.average_error):.3g} %, "
+        f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal",
+        fontsize=11,
+    )
+
+
+def _largest_per_cell(
+    u: np.ndarray, v: np.ndarray, errors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Raster of the largest error in every cell, about five points a cell; NaN where none is."""
+    side = int(np.clip(np.sqrt(errors.size / 5), 16, 400))
+    edges = [np.linspace(x.min(), x.max() + np.spacing(x.max()), side + 1) for x in (u, v)]
+    i, j = (
+        np.clip(np.searchsorted(edge, x, side="right") - 1, 0, side - 1)
+        for edge, x in zip(edges, (u, v), strict=True)
+    )
+    raster = np.full((side, side), -1.0)
+    np.maximum.at(raster, (i, j), errors)
+    return np.where(raster < 0, np.nan, raster), edges[0], edges[1]
+
+
+def _turn_like_the_surface(axes: "Axes", surface: Any, view: View) -> None:
+    """Let u and v run the way they run in the left picture (right or left, up or down)."""
+    net = np.asarray(surface.control_points, dtype=float)
+    if net.shape[-1] != 3:
+        return
+    corners = view(net[[0, -1]][:, [0, -1]])
+    along_u = (corners[1] - corners[0]).mean(axis=0)
+    along_v = (corners[:, 1] - corners[:, 0]).mean(axis=0)
+    if along_u[0] < 0:
+        axes.invert_xaxis()
+    if along_v[1] < 0:
+        axes.invert_yaxis()
+
+
+def _save(figure: "Figure", path: Path, dpi: int) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix.lstrip(".").lower() or "png", dpi=dpi)
+    write_atomically(path, buffer.getvalue())

@@ -1,0 +1,37 @@
+"""The strict session: x64 on, no silent broadcasting, shapes and dtypes checked on every call.
+
+`--float32` is the second pass: x64 off, and only the tests marked `float32_too`.
+"""
+
+import jax
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+# Before anything imports jaxfit: every function of the package then checks its annotations.
+install_import_hook("jaxfit", "beartype.beartype")
+
+settings.register_profile(
+    "jaxfit", database=None, deadline=None, derandomize=True, max_examples=20, print_blob=False
+)
+settings.load_profile("jaxfit")
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--float32",
+        action="store_true",
+        help="run the tests marked float32_too in single precision, and no others",
+    )
+
+
+def pytest_configure(config):
+    jax.config.update("jax_enable_x64", not config.getoption("--float32"))
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--float32"):
+        return
+    kept = [item for item in items if item.get_closest_marker("float32_too")]
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = kept

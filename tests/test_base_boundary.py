@@ -1,0 +1,93 @@
+"""A Boundary has common corners, no repeats, and says in one sentence what is wrong with it."""
+
+import helpers
+import jax
+import numpy as np
+import pytest
+
+from jaxfit._base import Boundary
+
+
+def square(n=5):
+    """Four sides of the unit square in space, n vertices each."""
+    s = np.linspace(0, 1, n)
+    o, i = np.zeros(n), np.ones(n)
+    sides = {"v0": (s, o), "v1": (s, i), "u0": (o, s), "u1": (i, s)}
+    return {name: np.stack([*xy, xy[0] * xy[1]], axis=1) for name, xy in sides.items()}
+
+
+@pytest.mark.float32_too
+def test_edges_of_a_grid_are_taken_in_the_documented_order():
+    grid = helpers.wavy_grid(5, 4)
+    boundary = Boundary.from_grid(grid)
+    for name, edge in helpers.grid_edges(grid).items():
+        np.testing.assert_allclose(getattr(boundary, name), edge, rtol=helpers.eps())
+
+
+def test_nearly_common_corners_become_common():
+    sides = square()
+    sides["u1"][0] += 1e-7
+    boundary = Boundary(**sides)
+    np.testing.assert_array_equal(boundary.u1[0], boundary.v0[-1])
+    with pytest.raises(ValueError, match="do not meet"):
+        Boundary(**sides, tolerance=1e-9)
+
+
+@pytest.mark.float32_too
+def test_consecutive_duplicates_are_dropped_and_both_ends_stay():
+    sides = square()
+    sides["v0"] = np.repeat(sides["v0"], [3, 1, 2, 1, 4], axis=0)
+    assert Boundary(**sides).v0.shape == (5, 3)
+    np.testing.assert_array_equal(Boundary(**sides).v0, Boundary(**square()).v0)
+
+
+def test_a_gap_is_reported_with_its_place_and_size():
+    sides = square()
+    sides["u1"] = sides["u1"] + np.array([0.0, 0.0, 0.5])
+    sentence = r"end of v0 and the start of u1 are 0.5 apart \(24 % .*share their corner points"
+    with pytest.raises(ValueError, match=sentence):
+        Boundary(**sides)
+
+
+@pytest.mark.parametrize("turned", [("v1",), ("u0", "u1")])
+def test_a_reversed_polyline_is_named(turned):
+    sides = square()
+    for name in turned:
+        sides[name] = sides[name][::-1]
+    with pytest.raises(ValueError, match=f"reverse {' and '.join(turned)}"):
+        Boundary(**sides)
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "sentence"),
+    [
+        ("v1", np.ones((1, 3)), "v1 must hold at least 2 points"),
+        ("u0", np.full((4, 3), np.inf), "u0 must be finite"),
+        ("u1", np.ones((4, 2)), "u1 has 2 coordinates a vertex and v0 has 3"),
+        ("v0", np.ones((4, 3)), "v0 has length zero"),
+        ("u0", np.ones(4), "u0 must have 2 dimensions"),
+    ],
+)
+def test_impossible_polylines_are_refused(name, line, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Boundary(**{**square(), name: line})
+
+
+def test_a_grid_of_one_row_is_refused():
+    with pytest.raises(ValueError, match="at least 2 x 2"):
+        Boundary.from_grid(np.ones((1, 5, 3)))
+
+
+def test_a_closed_side_is_accepted():
+    angle = np.linspace(0, 2 * np.pi, 9)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring[-1] = ring[0]
+    tube = np.stack([np.pad(ring, [(0, 0), (0, 1)], constant_values=z) for z in (0.0, 1.0)], axis=1)
+    boundary = Boundary.from_grid(tube)
+    np.testing.assert_array_equal(boundary.v0[0], boundary.v0[-1])
+
+
+def test_a_boundary_goes_through_jit_and_is_built_inside():
+    sides = {name: jax.numpy.asarray(x) for name, x in square().items()}
+    boundary = jax.jit(lambda **kw: Boundary(**kw))(**sides)
+    np.testing.assert_array_equal(jax.jit(lambda b: 2 * b.v1)(boundary), 2 * sides["v1"])

@@ -1,0 +1,281 @@
+"""What the command line hands to the fit, shows, and returns; the fit itself is faked here."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import wavy_cloud, wavy_grid, wavy_surface
+
+import jaxfit
+from jaxfit import _cli, _cli_report
+from jaxfit.io import read_surface
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """Fakes of the two ways to fit; every call is noted, with what it is to return."""
+    calls = SimpleNamespace(made=[], average=1e-5, maximum=1e-4, converged=True, fails=None)
+
+    def fake(name):
+        def fit(data, *args, **options):
+            calls.made.append((name, data, args, options))
+            if calls.fails:
+                raise calls.fails
+            if options["progress"]:
+                options["progress"](3, 10, calls.average, calls.maximum)
+            count = np.asarray(data).reshape(-1, 3).shape[0]
+            u, v = np.random.default_rng(0).uniform(size=(2, count))
+            return SimpleNamespace(
+                surface=wavy_surface(),
+                u=u,
+                v=v,
+                errors=np.full(count, calls.average),
+                average_error=calls.average,
+                maximum_error=calls.maximum,
+                converged=calls.converged,
+                message="The errors are within their tolerances.",
+                stats={"num_steps": 3},
+            )
+
+        return fit
+
+    for name in ("interpolate", "fit_points"):
+        monkeypatch.setattr(jaxfit, name, fake(name), raising=False)
+    return calls
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with one file of each kind, as the current one."""
+    points, edges = wavy_cloud(60)
+    sides = {f"boundary_{side}": polyline for side, polyline in edges.items()}
+    np.savez(tmp_path / "cloud.npz", points=points, **sides)
+    np.savez(tmp_path / "border.npz", **sides)
+    np.savez(tmp_path / "grid.npz", grid=wavy_grid(8, 7))
+    np.savetxt(tmp_path / "bare.xyz", points)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*argv):
+    return _cli.main(["fit", *argv, "-o", "s.npz", "--no-picture"])
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# ------------------------------------------------------------------ choices
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        (["grid.npz"], "interpolate"),
+        (["grid.npz", "--net", "5x5"], "fit_points"),
+        (["grid.npz", "--method", "approximate"], "fit_points"),
+        (["cloud.npz"], "fit_points"),
+        (["bare.xyz", "--grid", "10x6"], "interpolate"),
+        (["bare.xyz", "--boundary", "border.npz"], "fit_points"),
+    ],
+)
+def test_the_method_follows_from_the_data(fits, folder, argv, expected):
+    assert run(*argv) == 0
+    assert [made[0] for made in fits.made] == [expected]
+
+
+def test_large_grids_are_approximated(fits, folder):
+    np.savez("large.npz", grid=wavy_grid(201, 200))
+    assert run("large.npz") == 0
+    name, points, (boundary,), options = fits.made[0]
+    assert (name, points.shape, options["net"]) == ("fit_points", (40200, 3), None)
+    np.testing.assert_allclose(boundary.v1, wavy_grid(201, 200)[:, -1], atol=1e-12)
+
+
+def test_the_terrain_has_its_own_net(fits, folder):
+    assert run("jacksboro") == 0
+    name, points, _, options = fits.made[0]
+    assert (name, points.shape, options["net"]) == ("fit_points", (138632, 3), (62, 57))
+    assert run("jacksboro", "--net", "20x30") == 0
+    assert fits.made[1][3]["net"] == (20, 30)
+
+
+def test_options_arrive_as_fractions(fits, folder):
+    argv = "--net 8x9 --order 3x5 --tol-average 0.02 --tol-maximum 0.5% --max-steps 7".split()
+    assert run("cloud.npz", *argv) == 0
+    assert fits.made[0][3] == {
+        "net": (8, 9),
+        "order": (3, 5),
+        "tol_average": pytest.approx(2e-4),
+        "tol_maximum": pytest.approx(5e-3),
+        "max_steps": 7,
+        "progress": None,
+    }
+    assert run("grid.npz", "--tol-average", "0.1", "--tol-maximum", "0.01") in (0, 1)
+    assert fits.made[1][3] == {
+        "order": (4, 4),
+        "tolerance": pytest.approx(1e-4),
+        "progress": None,
+    }
+
+
+def test_the_surface_is_written(fits, folder):
+    assert run("cloud.npz") == 0
+    np.testing.assert_array_equal(
+        read_surface("s.npz").control_points, wavy_surface().control_points
+    )
+
+
+# --------------------------------------------------------------- exit codes
+
+
+@pytest.mark.parametrize(
+    ("argv", "code"),
+    [
+        (["cloud.npz"], 0),
+        (["cloud.npz", "--tol-average", "0.001"], 0),
+        (["cloud.npz", "--tol-average", "0.0009"], 1),
+        (["cloud.npz", "--tol-maximum", "0.005"], 1),
+        (["grid.npz"], 1),
+        (["grid.npz", "--tol-maximum", "0.02"], 0),
+    ],
+)
+def test_a_tolerance_that_was_missed_is_told(fits, folder, argv, code):
+    fits.average, fits.maximum, fits.converged = 1e-5, 1e-4, False
+    assert run(*argv) == code
+    assert (folder / "s.npz").is_file()
+
+
+@pytest.mark.parametrize("how", ["nan", "raise"])
+def test_a_numerical_failure_writes_nothing(fits, folder, capsys, how):
+    before = names(folder)
+    if how == "nan":
+        fits.average = float("nan")
+    else:
+        fits.fails = RuntimeError("Out of memory\nwhile allocating.")
+    assert run("cloud.npz") == 3
+    assert names(folder) == before
+    captured = capsys.readouterr()
+    assert captured.err.startswith("jaxfit: error: the fit failed: ")
+    assert captured.err.count("\n") == 1
+
+
+def test_interruption_writes_nothing(fits, folder, capsys):
+    before = names(folder)
+    fits.fails = KeyboardInterrupt()
+    assert run("cloud.npz") == 130
+    assert names(folder) == before
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ([], "see jaxfit --help"),
+        (["fit", "cloud.npz"], "-o/--output; see jaxfit fit --help"),
+        (["fit", "-o", "s.npz"], "INPUT"),
+        (["draw", "cloud.npz"], "'draw'"),
+        (["fit", "none.npz", "-o", "s.npz"], "none.npz does not exist"),
+        (["fit", "bare.xyz", "-o", "s.npz"], "without a boundary; give"),
+        (["fit", "bare.xyz", "-o", "s.npz", "--method", "interpolate"], "cannot be interpolated"),
+        (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "7 x 7 grid of 49"),
+        (["fit", "bare.xyz", "-o", "s.npz", "--boundary", "grid.npz"], "holds no boundary"),
+        (["fit", "grid.npz", "-o", "s.npz", "--method", "interpolate", "--net", "5x5"], "--net"),
+        (["fit", "cloud.npz", "-o", "s.stl"], "suffix .stl"),
+        (["fit", "cloud.npz", "-o", "none/s.npz"], "does not exist; make it first"),
+        (["fit", "cloud.npz", "-o", "cloud.npz"], "is the file that is read"),
+        (["fit", "cloud.npz", "-o", "./border.npz", "--boundary", "border.npz"], "is read"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--picture", "s.stl"], "suffix .stl"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--net", "5"], "'5' is no pair of counts"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--tol-average", "-1"], "'-1' is no percentage"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--tol-maximum", "nan"], "'nan' is no percentage"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--max-steps", "0"], "'0' is no number of steps"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--method", "guess"], "'guess'"),
+    ],
+)
+def test_bad_usage_is_one_sentence(fits, folder, capsys, argv, said):
+    before = names(folder)
+    assert _cli.main(argv) == 2
+    assert names(folder) == before
+    assert not fits.made
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("jaxfit: error: ")
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+
+
+def test_a_grid_without_a_boundary_says_why(fits, folder, capsys):
+    grid = wavy_grid(8, 7)
+    grid[0] = grid[0, 0]
+    np.savez("pole.npz", grid=grid)
+    assert run("pole.npz") == 0  # interpolation needs none
+    assert run("pole.npz", "--net", "5x5") == 2
+    assert capsys.readouterr().err.startswith("jaxfit: error: ")
+
+
+# ------------------------------------------------------------------- output
+
+
+@pytest.mark.parametrize("rich", [True, False])
+def test_the_table_says_all(fits, folder, capsys, monkeypatch, rich):
+    if not rich:
+        monkeypatch.setattr(_cli_report.importlib.util, "find_spec", lambda name: None)
+    assert run("grid.npz") == 0
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    for said in (
+        "grid.npz",
+        "56 (grid 8 x 7)",
+        "7 x 6",
+        "4 x 4",
+        "interpolate, double precision",
+        "0.001 % of the diagonal",
+        "0.01 % of the diagonal",
+        "within their tolerances",
+        "s.npz",
+    ):
+        assert said in captured.out
+
+
+def test_quiet_is_silent(fits, folder, capsys):
+    assert run("cloud.npz", "--quiet") == 0
+    captured = capsys.readouterr()
+    assert captured.out == captured.err == ""
+
+
+def test_progress_goes_to_a_terminal_only(fits, folder, capsys, monkeypatch):
+    run("cloud.npz")
+    assert fits.made[-1][3]["progress"] is None
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    run("cloud.npz")
+    assert fits.made[-1][3]["progress"] is not None
+    run("cloud.npz", "--quiet")
+    assert fits.made[-1][3]["progress"] is None
+
+
+def test_the_picture_lies_beside_the_surface(fits, folder):
+    assert _cli.main(["fit", "cloud.npz", "-o", "s.json", "--quiet"]) == 0
+    assert (folder / "s.png").read_bytes().startswith(b"\x89PNG")
+    assert _cli.main(["fit", "cloud.npz", "-o", "t.json", "--quiet", "--picture", "p.svg"]) == 0
+    assert (folder / "p.svg").is_file()
+    assert not (folder / "t.png").exists()
+
+
+def test_without_matplotlib_there_is_no_picture(fits, folder, capsys, monkeypatch):
+    monkeypatch.setattr(_cli.importlib.util, "find_spec", lambda name: None)
+    assert _cli.main(["fit", "cloud.npz", "-o", "s.json", "--quiet"]) == 0
+    assert not (folder / "s.png").exists()
+    argv = ["fit", "cloud.npz", "-o", "s.json", "--picture", "p.png"]
+    assert _cli.main(argv) == 2
+    assert "jaxfit-surfaces[plot]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("argv", [["--help"], ["fit", "--help"], ["--version"]])
+def test_help_and_version(capsys, argv):
+    with pytest.raises(SystemExit) as caught:
+        _cli.main(argv)
+    assert caught.value.code == 0
+    said = capsys.readouterr().out
+    assert ("exit codes" in said) == ("fit" in argv)
+    assert (jaxfit.__version__ in said) == ("--version" in argv)

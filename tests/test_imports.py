@@ -1,0 +1,98 @@
+"""Rooms import only lower rooms, and `import jaxfit` is quiet and light."""
+
+import ast
+import re
+import subprocess
+import sys
+
+import pytest
+from helpers import CHECKOUT
+
+PACKAGE = CHECKOUT / "jaxfit"
+
+# Lowest first; a room may import its own modules and those of the lines above it.
+ROOMS = [
+    ("_errors", "_checks"),
+    ("_splines",),
+    ("_parameters",),
+    ("_cells",),
+    ("_closest",),
+    ("_base",),
+    ("_fit",),
+    ("_quality",),
+    ("io",),
+    ("plot",),
+    ("_cli_arguments", "_cli_report"),
+    ("_cli",),
+    ("__main__",),
+]
+HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
+TOP = HEIGHT["plot"]  # only what is above files and pictures may import the whole package
+
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def room_of(path):
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+def imported_rooms(path):
+    """Names of the rooms of jaxfit a file imports; "jaxfit" for the package as a whole."""
+    package = ("jaxfit", *path.relative_to(PACKAGE).parent.parts)
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+            base = ".".join(filter(None, (base, node.module)))
+            names = [f"{base}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in names:
+            root, *rest = name.split(".")
+            if root == "jaxfit":
+                yield rest[0] if rest and rest[0] in HEIGHT else "jaxfit"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_rooms_import_only_lower_rooms(path):
+    room = room_of(path)
+    if room == "__init__":
+        return  # the table of contents
+    assert room in HEIGHT, f"{path} is in no room; add it to ROOMS"
+    for other in imported_rooms(path):
+        if other == "jaxfit":
+            assert HEIGHT[room] > TOP, f"{path} imports the whole package"
+        else:
+            assert other == room or HEIGHT[other] < HEIGHT[room], f"{path} imports {other}"
+
+
+def test_no_room_changes_the_global_configuration():
+    changes = re.compile(r"config\.update|config\.\w+ = |enable_x64\(")
+    changed = [
+        str(path.relative_to(PACKAGE))
+        for path in MODULES
+        if changes.search(path.read_text()) and room_of(path) != "_cli"
+    ]
+    assert not changed
+
+
+def test_importing_the_package_is_light_and_changes_no_configuration():
+    program = """
+import sys, jax
+before = dict(jax.config.values)
+import jaxfit
+# The command line switches to double precision after this, so no array may exist yet.
+assert not jax.live_arrays(), jax.live_arrays()
+heavy = {"matplotlib", "jaxopt", "optimistix", "scipy.spatial", "scipy.interpolate", "rich"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+assert dict(jax.config.values) == before
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,231 @@
+"""Files of points are read exactly, and every bad one is named in one sentence."""
+
+import numpy as np
+import pytest
+from helpers import data, grid_edges, wavy_cloud, wavy_grid
+
+from jaxfit.io import InputError, jacksboro, read_boundary, read_points
+
+POINTS = np.arange(24.0).reshape(8, 3) ** 1.5
+
+
+def boundary_arrays(edges):
+    return {f"boundary_{side}": polyline for side, polyline in edges.items()}
+
+
+def npz(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def text(path, content):
+    path.write_text(content)
+    return path
+
+
+def sentence(path):
+    with pytest.raises(InputError) as caught:
+        read_points(path)
+    message = str(caught.value)
+    assert path.name in message
+    assert "\n" not in message
+    assert message.endswith(".")
+    return message
+
+
+# ------------------------------------------------------------------ good files
+
+
+def test_npz_with_points_and_boundary(tmp_path):
+    points, edges = wavy_cloud(50)
+    path = npz(tmp_path / "cloud.npz", points=points, extra=np.ones(3), **boundary_arrays(edges))
+    read = read_points(path)
+    assert read.name == "cloud"
+    assert read.grid is None
+    np.testing.assert_array_equal(read.points, points)
+    np.testing.assert_array_equal(read.cloud, points)
+    for side, polyline in edges.items():
+        np.testing.assert_allclose(getattr(read.boundary, side), polyline, atol=1e-12)
+        np.testing.assert_allclose(getattr(read_boundary(path), side), polyline, atol=1e-12)
+
+
+def test_npz_with_points_alone_has_no_boundary(tmp_path):
+    read = read_points(npz(tmp_path / "a.npz", points=POINTS))
+    assert read.boundary is None
+    with pytest.raises(InputError, match="holds no boundary"):
+        read_boundary(tmp_path / "a.npz")
+
+
+def test_npz_with_a_grid_has_its_edges_as_boundary(tmp_path):
+    grid = wavy_grid(5, 4)
+    read = read_points(npz(tmp_path / "a.npz", grid=grid))
+    assert read.points is None
+    np.testing.assert_array_equal(read.grid, grid)
+    np.testing.assert_array_equal(read.cloud, grid.reshape(-1, 3))
+    for side, polyline in grid_edges(grid).items():
+        np.testing.assert_allclose(getattr(read.boundary, side), polyline, atol=1e-12)
+
+
+def test_a_grid_whose_edge_is_one_point_has_no_boundary(tmp_path):
+    grid = wavy_grid(5, 4)
+    grid[0] = grid[0, 0]
+    assert read_points(npz(tmp_path / "pole.npz", grid=grid)).boundary is None
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int32])
+@pytest.mark.parametrize("columns", [3, 5])
+def test_npy_holds_points_or_a_grid(tmp_path, dtype, columns):
+    grid = np.arange(20 * columns).reshape(5, 4, columns).astype(dtype)
+    np.save(tmp_path / "g.npy", grid)
+    np.save(tmp_path / "p.npy", grid.reshape(20, columns))
+    np.testing.assert_array_equal(read_points(tmp_path / "g.npy").grid, grid[..., :3])
+    points = read_points(tmp_path / "p.npy").points
+    assert points.dtype == np.float64
+    np.testing.assert_array_equal(points, grid.reshape(20, columns)[:, :3])
+
+
+def lines(delimiter, extra=""):
+    return "".join(delimiter.join(map(repr, row)) + extra + "\n" for row in POINTS.tolist())
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.xyz", lines(" ")),
+        ("a.txt", "# made by hand\n\n" + lines("\t", "  # yes")),
+        ("a.csv", lines(",")),
+        ("a.csv", "x,y,z\n" + lines(", ")),
+        ("a.CSV", "\ufeffeast, north, height, red\n" + lines(",", ",255")),
+        ("a.xyz", "x y z\n" + lines("   ", " 0.5 0.5")),
+    ],
+)
+def test_text_is_read_exactly(tmp_path, name, content):
+    np.testing.assert_array_equal(read_points(text(tmp_path / name, content)).points, POINTS)
+
+
+def test_scattered_points_can_be_read_as_a_grid(tmp_path):
+    read = read_points(text(tmp_path / "a.xyz", lines(" ")))
+    np.testing.assert_array_equal(read.as_grid(4, 2).grid, POINTS.reshape(4, 2, 3))
+    with pytest.raises(InputError, match="8 points, which do not make a 3 x 3 grid"):
+        read.as_grid(3, 3)
+    with pytest.raises(InputError, match="two rows"):
+        read.as_grid(8, 1)
+
+
+# ------------------------------------------------------------------- bad files
+
+
+def test_files_that_are_not_there(tmp_path):
+    assert "does not exist" in sentence(tmp_path / "none.npz")
+    assert "is a folder" in sentence(tmp_path)
+    assert "suffix .stl" in sentence(text(tmp_path / "a.stl", "solid"))
+    assert "no suffix" in sentence(text(tmp_path / "points", "0 0 0"))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy", ".csv", ".xyz"])
+def test_empty_and_damaged_files(tmp_path, suffix):
+    path = text(tmp_path / f"a{suffix}", "")
+    assert "is empty" in sentence(path)
+    path.write_bytes(b"\xff\xfe\x00\x80 not what it says")
+    assert "plain" in sentence(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy"])
+def test_truncated_files(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    np.save(path, POINTS) if suffix == ".npy" else np.savez(path, points=POINTS)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert "is damaged" in sentence(path)
+
+
+def test_a_damaged_member_is_noticed(tmp_path):
+    path = npz(tmp_path / "a.npz", points=POINTS)
+    content = bytearray(path.read_bytes())
+    content[200] ^= 0xFF
+    path.write_bytes(content)
+    assert "is damaged" in sentence(path)
+
+
+def test_python_objects_are_never_loaded(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez(path, points=np.array([{"x": 1}, None], dtype=object))
+    assert "plain NumPy arrays" in sentence(path)
+    np.savez(path, points=POINTS, notes=np.array([{"x": 1}], dtype=object))
+    np.testing.assert_array_equal(read_points(path).points, POINTS)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({}, "neither a grid nor points, but nothing"),
+        ({"xyz": POINTS}, "neither a grid nor points, but xyz"),
+        ({"points": POINTS[:, :2]}, r"points has shape (8, 2); it must be (N, 3)"),
+        ({"points": POINTS.ravel()}, "points has shape (24,)"),
+        ({"grid": POINTS}, r"grid has shape (8, 3); it must be (n, m, 3)"),
+        ({"grid": POINTS[None]}, "grid of 1 x 8 points"),
+        ({"points": POINTS + 1j}, "real numbers"),
+        ({"points": POINTS.astype(str)}, "real numbers"),
+        ({"points": POINTS[:3]}, "3 points, but a surface needs at least 4"),
+        ({"points": POINTS[:1]}, "1 point, but"),
+        ({"points": POINTS[:0]}, "0 points, but"),
+        ({"points": POINTS, "boundary_v0": POINTS}, "without boundary_v1, boundary_u0"),
+    ],
+)
+def test_arrays_that_are_no_points(tmp_path, arrays, said):
+    assert said in sentence(npz(tmp_path / "a.npz", **arrays))
+
+
+def test_coordinates_that_are_no_numbers(tmp_path):
+    points = POINTS.copy()
+    points[[2, 5], 1] = np.nan, np.inf
+    assert "2 of 8 points in points" in sentence(npz(tmp_path / "a.npz", points=points))
+    assert "first at index 2;" in sentence(npz(tmp_path / "a.npz", points=points))
+    grid = points.reshape(2, 4, 3)
+    assert "first at index 0, 2;" in sentence(npz(tmp_path / "a.npz", grid=grid))
+
+
+def test_a_bad_boundary_is_refused(tmp_path):
+    points, edges = wavy_cloud(50)
+    arrays = boundary_arrays(edges)
+    arrays["boundary_v0"] = arrays["boundary_v0"][::-1]
+    assert "corner" in sentence(npz(tmp_path / "a.npz", points=points, **arrays))
+    arrays["boundary_v0"] = np.full((4, 3), np.nan)
+    assert "4 of 4 points in boundary_v0" in sentence(
+        npz(tmp_path / "a.npz", points=points, **arrays)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.xyz", "0 0 0\n1 1 1\n\n1 0\n0 1 1\n", "line 4 has 2 columns"),
+        ("a.csv", "x,y,z\n0,0,0\n1,one,1\n", "line 3 has 'one' in place of a number"),
+        ("a.csv", "0,0,0\n1,,1\n", "line 2 has '' in place of a number"),
+        ("a.csv", "0 0 0\n1 1 1\n", "line 1 has 1 column, but a point has three"),
+        ("a.xyz", "0,0,0\n1,1,1\n", "separate x, y and z by blanks"),
+        ("a.xyz", "0 0 0\n1 nan 1\n0 1 inf\n1 1 1\n", "2 of 4 points have NaN"),
+        ("a.xyz", "# c\n0 0 0\n1 nan 1\n0 1 0\n1 1 1\n", "the first in line 3"),
+        ("a.xyz", "0 0 0\n1 0 1\n0 1 0\n", "3 points, but a surface needs at least 4"),
+        ("a.xyz", "# nothing\n\n", "holds no points"),
+        ("a.csv", "x,y,z\n", "holds no points"),
+    ],
+)
+def test_text_that_is_no_table(tmp_path, name, content, said):
+    assert said in sentence(text(tmp_path / name, content))
+
+
+# ----------------------------------------------------------------- the terrain
+
+
+def test_the_terrain_inside_matplotlib_is_in_metres():
+    terrain = jacksboro()
+    assert terrain.grid.shape == (403, 344, 3)
+    assert terrain.boundary is not None
+    np.testing.assert_allclose(terrain.grid.mean(axis=(0, 1))[:2], 0, atol=1e-6)
+    assert (np.diff(terrain.grid[..., 0], axis=0) > 0).all()  # first index east
+    assert (np.diff(terrain.grid[..., 1], axis=1) < 0).all()  # second index south
+    assert np.linalg.norm(np.ptp(terrain.cloud, axis=0)) == pytest.approx(43651.3, abs=0.1)
+
+
+def test_the_terrain_equals_the_data_set():
+    np.testing.assert_allclose(jacksboro().grid, data("jacksboro_dem")["grid"], rtol=1e-15)

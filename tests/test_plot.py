@@ -1,0 +1,133 @@
+"""Pictures show the whole surface and every error, and leave Matplotlib's global state alone."""
+
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers import wavy_surface
+from scipy.ndimage import binary_fill_holes
+
+from jaxfit.plot import surface_and_errors
+from jaxfit.plot._render import render
+from jaxfit.plot._view import choose_view
+
+pytest.importorskip("matplotlib")
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    monkeypatch.setattr("jaxfit.plot._render._PIXELS", 400)
+
+
+def fake_fit(shape, surface=None, seed=0):
+    u, v, errors = np.random.default_rng(seed).uniform(size=(3, *shape))
+    return SimpleNamespace(
+        surface=wavy_surface() if surface is None else surface,
+        u=u,
+        v=v,
+        errors=1e-3 * errors,
+        average_error=1e-3 * errors.mean(),
+        maximum_error=1e-3 * errors.max(),
+    )
+
+
+def with_points(change):
+    surface = wavy_surface()
+    net = change(np.asarray(surface.control_points))
+    return type(surface)(net, surface.knots_u, surface.knots_v)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf", ".jpg"])
+def test_a_picture_is_saved_and_returned(tmp_path, suffix):
+    figure = surface_and_errors(fake_fit((50,)), path=tmp_path / f"p{suffix}", title="cloud")
+    assert (tmp_path / f"p{suffix}").stat().st_size > 10_000
+    assert [path.name for path in tmp_path.iterdir()] == [f"p{suffix}"]
+    said = [text.get_text() for axes in figure.axes for text in (axes.title, axes.yaxis.label)]
+    assert "7 \N{MULTIPLICATION SIGN} 6 control points" in said
+    assert "error, % of the diagonal" in said
+    assert any(text.startswith("average 0.0") and "maximum 0." in text for text in said)
+
+
+def test_no_global_state_is_touched():
+    surface_and_errors(fake_fit((50,)))
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_errors_of_a_grid_are_an_image():
+    points = np.zeros((9, 8, 3))
+    flat = surface_and_errors(fake_fit((72,)), points)
+    grid = surface_and_errors(fake_fit((9, 8)))
+    for figure in (flat, grid):
+        assert figure.axes[1].images[0].get_array().shape == (8, 9)
+    with pytest.raises(ValueError, match="grid of 9 x 8, but the fit has 50 errors"):
+        surface_and_errors(fake_fit((50,)), points)
+
+
+def test_large_clouds_become_a_raster_of_largest_errors():
+    fit = fake_fit((140_000,))
+    fit.errors[7] = 1.0
+    before = time.perf_counter()
+    figure = surface_and_errors(fit)
+    assert time.perf_counter() - before < 10
+    raster = figure.axes[1].collections[0].get_array()
+    assert raster.max() == pytest.approx(100)
+    assert raster.size < fit.errors.size / 3
+
+
+def test_the_surface_fills_its_outline():
+    image, _ = render(wavy_surface())
+    assert image.shape[1] / image.shape[0] == pytest.approx(1.1, abs=0.01)
+    opaque = image[..., 3] > 0.99
+    assert 0.2 < opaque.mean() < 0.95
+    np.testing.assert_array_equal(binary_fill_holes(opaque), opaque)
+
+
+@pytest.mark.parametrize("flip", [False, True])
+def test_terrain_is_stretched_and_seen_from_above(flip):
+    surface = with_points(lambda p: p * np.array([1.0, 1.0, 0.2]))
+    net = np.asarray(surface.grid(np.linspace(0, 1, 20), np.linspace(0, 1, 20)))
+    view = choose_view(net[::-1] if flip else net)
+    assert view.relief == "z"
+    assert view.factor > 1
+    assert view.toward[2] > 0.5
+    assert view.right[0] > 0.7
+    assert view.up[1] > 0.5
+
+
+def test_round_surfaces_are_seen_from_outside():
+    angle, height = np.meshgrid(np.linspace(0, np.pi, 20), np.linspace(0, 2, 20), indexing="ij")
+    net = np.stack([np.cos(angle), -np.sin(angle), height], axis=-1)
+    for view in (choose_view(net), choose_view(net[::-1]), choose_view(net.swapaxes(0, 1))):
+        assert view.relief == ""
+        assert view.toward[1] < -0.8
+        assert view.up[2] > 0.8
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p * np.array([1.0, 1.0, 0.0]),  # a plane
+        lambda p: p * np.array([1.0, 0.0, 0.0]),  # collapsed to a line
+        lambda p: p * 1e-9,
+        lambda p: p + 5e6,
+        lambda p: p[..., :2],
+        lambda p: p[..., 2:],
+    ],
+)
+def test_odd_surfaces_are_drawn_all_the_same(change):
+    image, _ = render(with_points(change))
+    assert np.isfinite(image).all()
+
+
+def test_exact_fits_are_drawn():
+    fit = fake_fit((50,))
+    fit.errors = np.zeros(50)
+    surface_and_errors(fit)
+
+
+def test_missing_matplotlib_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"jaxfit-surfaces\[plot\]"):
+        surface_and_errors(fake_fit((50,)))
