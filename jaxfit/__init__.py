@@ -2,10 +2,37 @@
 
 __version__ = "0.1.0"
 
+from jaxfit._base import Boundary as Boundary
+from jaxfit._base import Greville as Greville
+from jaxfit._base import Uniform as Uniform
+from jaxfit._base import base_surface as base_surface
+from jaxfit._base import coons_surface as coons_surface
 from jaxfit._closest import ClosestPoint as ClosestPoint
 from jaxfit._closest import HuWallner as HuWallner
 from jaxfit._closest import Newton as Newton
 from jaxfit._closest import PointStatus as PointStatus
 from jaxfit._closest import closest_point as closest_point
+from jaxfit._fit import RESULTS as RESULTS
+from jaxfit._fit import Fit as Fit
+from jaxfit._fit import GeometricApproximation as GeometricApproximation
+from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
+from jaxfit._fit import History as History
+from jaxfit._fit import approximate as approximate
+from jaxfit._fit import fit_points as fit_points
+from jaxfit._fit import interpolate as interpolate
+from jaxfit._parameters import Centripetal as Centripetal
+from jaxfit._parameters import ChordLength as ChordLength
+from jaxfit._parameters import curve_parameters as curve_parameters
+from jaxfit._parameters import grid_parameters as grid_parameters
+from jaxfit._splines import BezierCurves as BezierCurves
+from jaxfit._splines import BezierPatches as BezierPatches
 from jaxfit._splines import BSplineCurve as BSplineCurve
 from jaxfit._splines import BSplineSurface as BSplineSurface
+from jaxfit._splines import Curvature as Curvature
+from jaxfit._splines import FirstForm as FirstForm
+from jaxfit._splines import SecondForm as SecondForm
+from jaxfit._splines import averaging_knots as averaging_knots
+from jaxfit._splines import clamped_uniform_knots as clamped_uniform_knots
+from jaxfit._splines import greville_abscissae as greville_abscissae
+from jaxfit._splines import insertion_matrix as insertion_matrix
+from jaxfit._splines import merge_knots as merge_knots

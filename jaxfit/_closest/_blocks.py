@@ -53,12 +53,14 @@ def finish(
     tolerance: Array,
     noise: Array,
     max_steps: Array,
+    borders: bool = True,
 ) -> Feet:
     """Iterate all feet that are not done, block by block, then those without success on the borders.
 
     Stages: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
     from the nearest of what was found, so that "converged" always means: with respect to the whole
-    surface. A stage makes several passes, each over the feet that the last one has left.
+    surface. A stage makes several passes, each over the feet that the last one has left. Without
+    `borders` there is stage 0 only.
     """
     passes = -(-max_steps // STEPS_PER_PASS)
 
@@ -66,10 +68,8 @@ def finish(
         number, feet = carry
         return (number <= AGAIN) & jnp.any(~feet.converged)
 
-    def stage(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
-        number, old = carry
+    def iterate(number: Array, feet: Feet) -> Feet:
         border = _border(pieces, number)
-        begun = _begin(old, number, border)
 
         def going(x: tuple[Array, Feet]) -> Array:
             return (x[0] < passes) & jnp.any(~x[1].done)
@@ -77,9 +77,15 @@ def finish(
         def one(x: tuple[Array, Feet]) -> tuple[Array, Feet]:
             return x[0] + 1, _pass(method, pieces, target, x[1], border, tolerance, noise)
 
-        _, new = lax.while_loop(going, one, (jnp.asarray(0), begun))
+        return lax.while_loop(going, one, (jnp.asarray(0), feet))[1]
+
+    def stage(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
+        number, old = carry
+        new = iterate(number, _begin(old, number, _border(pieces, number)))
         return number + 1, _merge(old, new, number, noise)
 
+    if not borders:
+        return iterate(jnp.asarray(EVERYWHERE), feet)
     return lax.while_loop(unsettled, stage, (jnp.asarray(EVERYWHERE), feet))[1]
 
 
@@ -97,16 +103,17 @@ def _begin(old: Feet, number: Array, border: tuple[Array, ...]) -> Feet:
     """The feet a stage works on; after the first, those not converged, afresh from their best."""
     low_u, high_u, low_v, high_v = border
     fresh = new_feet(jnp.clip(old.best_u, low_u, high_u), jnp.clip(old.best_v, low_v, high_v))
-    fresh = eqx.tree_at(lambda x: (x.steps, x.done), fresh, (old.steps, old.converged))
+    whole = jnp.stack([fresh.halvings, old.steps, old.whole[3], fresh.whole[3]])
+    fresh = Feet(fresh.real, whole)
     return keep(jnp.broadcast_to(number == EVERYWHERE, old.done.shape), old, fresh)
 
 
 def _merge(old: Feet, new: Feet, number: Array, noise: Array) -> Feet:
     """What a stage found; on a border only what is nearer, which has not converged by that."""
-    new = eqx.tree_at(lambda x: x.done, new, jnp.ones_like(new.done))
+    new = new.marked(jnp.ones_like(new.done), new.converged)
     nearer = new.best < old.best - noise * (2.0 * jnp.sqrt(old.best) + noise)
     nearer = jnp.where(jnp.isinf(old.best), jnp.isfinite(new.best), nearer)
-    on_border = eqx.tree_at(lambda x: x.converged, new, jnp.zeros_like(new.converged))
+    on_border = new.marked(new.done, jnp.zeros_like(new.converged))
     whole = jnp.broadcast_to((number == EVERYWHERE) | (number == AGAIN), old.done.shape)
     return keep(old.converged, old, keep(whole, new, keep(nearer, on_border, old)))
 
@@ -133,11 +140,12 @@ def _pass(
         start, feet = carry
         index = lax.dynamic_slice(chosen, (start,), (size,))
         inside = jnp.minimum(index, points - 1)
-        mine = jax.tree.map(lambda x: x[inside], feet)
-        mine = eqx.tree_at(lambda x: x.done, mine, mine.done | (index >= points))
+        mine = Feet(feet.real[:, inside], feet.whole[:, inside])
+        mine = mine.marked(mine.done | (index >= points), mine.converged)
         mine = _run(method, pieces, target[:, inside], mine, border, tolerance, noise)
-        put = jax.tree.map(lambda every, x: every.at[index].set(x, mode="drop"), feet, mine)
-        return start + size, put
+        real = feet.real.at[:, index].set(mine.real, mode="drop")
+        whole = feet.whole.at[:, index].set(mine.whole, mode="drop")
+        return start + size, Feet(real, whole)
 
     return lax.while_loop(lambda x: x[0] < count, block, (jnp.asarray(0), feet))[1]
 
@@ -157,7 +165,7 @@ def _run(
     # A pass may have ended while looking across a crease; trials start within the home stretch.
     trial_u = jnp.clip(feet.u, pieces.axis_u.low[home_u], pieces.axis_u.high[home_u])
     trial_v = jnp.clip(feet.v, pieces.axis_v.low[home_v], pieces.axis_v.high[home_v])
-    feet = eqx.tree_at(lambda x: (x.u, x.v), feet, (trial_u, trial_v))
+    feet = Feet(jnp.stack([trial_u, trial_v, *feet.real[2:]]), feet.whole)
     home = Home(home_u, home_v, home_u, home_v, zero, jnp.full_like(feet.best, jnp.inf))
 
     def unfinished(carry: tuple[Array, Feet, Home]) -> Array:
@@ -209,14 +217,11 @@ def _cross_creases(
     creased = (after.across_u != after.base_u) | (after.across_v != after.base_v)
     goes_on = arrived & creased & (after.tries <= LAST_TRY)
     home = jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), after, home)
-    flags = (new.done & ~goes_on, new.converged & ~goes_on)
-    return eqx.tree_at(lambda x: (x.done, x.converged), new, flags), home
+    return new.marked(new.done & ~goes_on, new.converged & ~goes_on), home
 
 
 def _across(axis: Axis, u: Array, home: Array) -> Array:
     """The cell just across the crease that u lies on, or `home` if it lies on none."""
     at_low = (u <= axis.low[home]) & (u > axis.breaks[0])
     at_high = (u >= axis.high[home]) & (u < axis.breaks[-1])
-    left = jnp.searchsorted(axis.breaks, axis.low[home], side="left").astype(jnp.int32) - 1
-    right = jnp.searchsorted(axis.breaks, axis.high[home], side="right").astype(jnp.int32) - 1
-    return jnp.where(at_low, left, jnp.where(at_high, right, home))
+    return jnp.where(at_low, axis.before[home], jnp.where(at_high, axis.after[home], home))

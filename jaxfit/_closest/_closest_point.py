@@ -12,19 +12,17 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import evaluate_values
+from jaxfit._cells import values_at
 from jaxfit._checks import as_floating, as_points, is_concrete
 from jaxfit._closest._feet import Feet
 from jaxfit._closest._implicit import foot_parameters
 from jaxfit._closest._project import project
-from jaxfit._closest._seeds import MOST_ROUNDS, Samples, Search, sample
+from jaxfit._closest._seeds import Samples, Search, sample
 from jaxfit._closest._steps import AbstractFootMethod, Newton
 from jaxfit._precision import advise_x64, bucket, default_foot_tolerance
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import Pieces, as_surface_arrays, make_pieces
-
-VALUES_BLOCK = 4096
 
 
 class PointStatus(enum.IntEnum):
@@ -196,20 +194,8 @@ def _describe(
     pieces: Pieces, u: Array, v: Array, converged: Array
 ) -> tuple[Float[Array, "d points"], Int[Array, " points"]]:
     """Foot points (centred) and their status."""
-    axis_u, axis_v = pieces.axis_u, pieces.axis_v
-    size = min(VALUES_BLOCK, u.shape[0])
-
-    def values(uv: Array) -> Array:
-        cell_u, cell_v = axis_u.locate(uv[0]), axis_v.locate(uv[1])
-        s = (uv[0] - axis_u.centre[cell_u]) / axis_u.half[cell_u]
-        t = (uv[1] - axis_v.centre[cell_v]) / axis_v.half[cell_v]
-        cell = pieces.coefficients[cell_u * axis_v.cells + cell_v]
-        return jnp.stack(evaluate_values(jnp.moveaxis(cell, 0, -1), s, t))
-
-    both = jnp.pad(jnp.stack([u, v]), ((0, 0), (0, -u.shape[0] % size)), mode="edge")
-    blocks = lax.map(values, both.reshape(2, -1, size).swapaxes(0, 1))
-    point = blocks.swapaxes(0, 1).reshape(blocks.shape[1], -1)[:, : u.shape[0]]
-    return point, _status(axis_u.breaks, axis_v.breaks, u, v, converged)
+    status = _status(pieces.axis_u.breaks, pieces.axis_v.breaks, u, v, converged)
+    return values_at(pieces, u, v), status
 
 
 def _status(breaks_u: Array, breaks_v: Array, u: Array, v: Array, converged: Array) -> Array:
@@ -234,60 +220,66 @@ def _on_host(
     count = points.shape[0]
     size = bucket(count)
     centred = np.asarray(points, np.float64) - np.asarray(prepared.centre, np.float64)
-    target = jnp.asarray(_padded(centred, size).T.astype(dtype))
     limits = (
         jnp.asarray(tolerance * extent(net, points), dtype),
         jnp.asarray(max_steps, jnp.int32),
     )
-    padding = np.arange(size) >= count
 
-    def feet_from(u: np.ndarray, v: np.ndarray, idle: np.ndarray) -> dict[str, np.ndarray]:
-        feet = _run(method, prepared.pieces, target, jnp.asarray(u), jnp.asarray(v), idle, *limits)
+    def feet_from(which: Any, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+        """Feet of the points `which`, from (u, v); always the same shapes."""
+        target = jnp.asarray(_padded(centred[which], size).T.astype(dtype))
+        starts = (jnp.asarray(_padded(np.asarray(x), size).astype(dtype)) for x in (u, v))
+        idle = np.arange(size) >= len(u)
+        feet = _run(method, prepared.pieces, target, *starts, idle, *limits)
         fields = dict(u=feet.best_u, v=feet.best_v, f=feet.best, ok=feet.converged, n=feet.steps)
-        return {name: np.array(x) for name, x in fields.items()}
+        return {name: np.array(x)[: len(u)] for name, x in fields.items()}
 
     if start is not None:
-        u, v = (_padded(np.asarray(x), size).astype(dtype) for x in start)
-        best = feet_from(u, v, padding)
+        best = feet_from(slice(None), *start)
     else:
-        best = _globally(feet_from, prepared, centred, size, dtype)
-    point, status = _describe(
-        prepared.pieces, jnp.asarray(best["u"]), jnp.asarray(best["v"]), jnp.asarray(best["ok"])
-    )
+        best = _globally(feet_from, Search(prepared.samples, centred), size)
+    padded = (jnp.asarray(_padded(best[name], size)) for name in ("u", "v", "ok"))
+    point, status = _describe(prepared.pieces, *padded)
     shifted = np.asarray(point).T[:count] + np.asarray(prepared.centre)
     with np.errstate(invalid="ignore"):
-        distance = np.sqrt(best["f"][:count])
-    fields = (best["u"][:count], best["v"][:count], shifted, distance)
-    flags = (best["ok"][:count], np.asarray(status)[:count], best["n"][:count])
+        distance = np.sqrt(best["f"])
+    fields = (best["u"], best["v"], shifted, distance)
+    flags = (best["ok"], np.asarray(status)[:count], best["n"])
     return ClosestPoint(*(jnp.asarray(x) for x in (*fields, *flags)))
 
 
-def _globally(
-    feet_from: Any, prepared: Prepared, points: np.ndarray, size: int, dtype: np.dtype
-) -> dict[str, np.ndarray]:
+def _globally(feet_from: Any, search: Search, size: int) -> dict[str, np.ndarray]:
     """The nearest foot of all: from the nearest sample, then from every rival that is left."""
-    search = Search(prepared.samples, points)
-    count = len(points)
-    u, v = (_padded(x, size).astype(dtype) for x in search.nearest())
-    best = feet_from(u, v, np.arange(size) >= count)
-    rivals = search.rivals(
-        best["u"][:count], best["v"][:count], np.sqrt(best["f"][:count].astype(np.float64))
-    )
-    for _ in range(MOST_ROUNDS):
-        which, start_u, start_v = rivals.next()
-        if not which.size:
-            break
-        idle = np.ones(size, bool)
-        idle[which] = False
-        u, v = best["u"].copy(), best["v"].copy()
-        u[which], v[which] = start_u, start_v
-        other = feet_from(u, v, idle)
-        rivals.found(other["u"][:count], other["v"][:count])
-        nearer = ~idle & (other["f"] < best["f"]) & (other["ok"] | ~best["ok"])
-        for name in ("u", "v", "f", "ok"):
-            best[name][nearer] = other[name][nearer]
-        best["n"][which] += other["n"][which]
+    best = feet_from(slice(None), *search.nearest())
+    distance = np.sqrt(best["f"].astype(np.float64))
+    rivals = search.rivals(best["u"], best["v"], distance)
+    which, u, v = rivals.first()
+    if which.size:
+        other = feet_from(which, u, v)
+        everywhere_u, everywhere_v = best["u"].copy(), best["v"].copy()
+        everywhere_u[which], everywhere_v[which] = other["u"], other["v"]
+        rivals.found(everywhere_u, everywhere_v)
+        _take_nearer(best, which, other)
+    which, u, v = rivals.rest()
+    for begin in range(0, which.size, size):
+        part = slice(begin, begin + size)
+        _take_nearer(best, which[part], feet_from(which[part], u[part], v[part]))
     return best
+
+
+def _take_nearer(
+    best: dict[str, np.ndarray], which: np.ndarray, other: dict[str, np.ndarray]
+) -> None:
+    """Replace feet by nearer ones; `which` may name a point several times."""
+    np.add.at(best["n"], which, other["n"])
+    # Of each point's, the converged ones first and of these the nearest.
+    order = np.lexsort((other["f"], ~other["ok"], which))
+    first = order[np.unique(which[order], return_index=True)[1]]
+    mine = which[first]
+    nearer = other["f"][first] < best["f"][mine]
+    nearer &= other["ok"][first] | ~best["ok"][mine]
+    for name in ("u", "v", "f", "ok"):
+        best[name][mine[nearer]] = other[name][first[nearer]]
 
 
 def _padded(x: np.ndarray, size: int) -> np.ndarray:

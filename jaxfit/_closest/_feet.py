@@ -19,17 +19,79 @@ LONGEST_STEP = 4.0  # in local coordinates: two cells
 
 
 class Feet(eqx.Module):
-    """Trial parameters, and the best (last accepted) foot of every point. All arrays of one shape."""
+    """Trial parameters, and the best (last accepted) foot of every point.
 
-    u: Float[Array, "..."]
-    v: Float[Array, "..."]
-    best_u: Float[Array, "..."]
-    best_v: Float[Array, "..."]
-    best: Float[Array, "..."]  # squared distance, infinite before the first evaluation
-    halvings: Int[Array, "..."]
-    steps: Int[Array, "..."]
-    done: Bool[Array, "..."]
-    converged: Bool[Array, "..."]
+    Two stacks of arrays rather than nine arrays: gathering, scattering and choosing then compile once each.
+    """
+
+    real: Float[Array, "5 *shape"]
+    whole: Int[Array, "4 *shape"]
+
+    @staticmethod
+    def of(
+        u: Array,
+        v: Array,
+        best_u: Array,
+        best_v: Array,
+        best: Array,
+        halvings: Array,
+        steps: Array,
+        done: Array,
+        converged: Array,
+    ) -> "Feet":
+        """Stack the parts."""
+        numbers = [x.astype(jnp.int32) for x in (halvings, steps, done, converged)]
+        return Feet(jnp.stack([u, v, best_u, best_v, best]), jnp.stack(numbers))
+
+    @property
+    def u(self) -> Float[Array, "*shape"]:
+        """Trial parameter, to be evaluated next."""
+        return self.real[0]
+
+    @property
+    def v(self) -> Float[Array, "*shape"]:
+        """Trial parameter."""
+        return self.real[1]
+
+    @property
+    def best_u(self) -> Float[Array, "*shape"]:
+        """Parameter of the last accepted foot."""
+        return self.real[2]
+
+    @property
+    def best_v(self) -> Float[Array, "*shape"]:
+        """Parameter of the last accepted foot."""
+        return self.real[3]
+
+    @property
+    def best(self) -> Float[Array, "*shape"]:
+        """Squared distance of the last accepted foot, infinite before the first evaluation."""
+        return self.real[4]
+
+    @property
+    def halvings(self) -> Int[Array, "*shape"]:
+        """How often the present step has been halved."""
+        return self.whole[0]
+
+    @property
+    def steps(self) -> Int[Array, "*shape"]:
+        """Evaluations so far."""
+        return self.whole[1]
+
+    @property
+    def done(self) -> Bool[Array, "*shape"]:
+        """Whether nothing more is to be tried."""
+        return self.whole[2] > 0
+
+    @property
+    def converged(self) -> Bool[Array, "*shape"]:
+        """Whether the foot has been found to the tolerance."""
+        return self.whole[3] > 0
+
+    def marked(self, done: Array, converged: Array) -> "Feet":
+        """The same feet with other flags."""
+        flags = jnp.stack([done.astype(jnp.int32), converged.astype(jnp.int32)])
+        return Feet(self.real, jnp.concatenate([self.whole[:2], flags]))
 
 
 class Box(eqx.Module):
@@ -49,7 +111,7 @@ def new_feet(u: Float[Array, "..."], v: Float[Array, "..."]) -> Feet:
     """Feet that have not been evaluated yet."""
     zero = jnp.zeros(u.shape, jnp.int32)
     no = jnp.zeros(u.shape, bool)
-    return Feet(u, v, u, v, jnp.full_like(u, jnp.inf), zero, zero, no, no)
+    return Feet.of(u, v, u, v, jnp.full_like(u, jnp.inf), zero, zero, no, no)
 
 
 def advance(
@@ -67,9 +129,9 @@ def advance(
     Feet that are done stay as they are.
     """
     always = tolerance < jnp.inf
-    step = propose(method, careful=True)
-    trial = staged(always, step, feet.u, feet.v, target, coefficients, box, tolerance)
-    next_u, next_v, f = trial
+    first = staged(always, measure_at(method), feet.u, feet.v, target, coefficients, box)
+    f = first.f
+    next_u, next_v = staged(always, next_trial(method, True), first, feet.u, feet.v, box, tolerance)
     accepted = f <= feet.best + noise * (2.0 * jnp.sqrt(f) + noise)
     still = (next_u == feet.u) & (next_v == feet.v)
     back_u, back_v = 0.5 * (feet.u + feet.best_u), 0.5 * (feet.v + feet.best_v)
@@ -78,7 +140,7 @@ def advance(
     done = arrived | (~accepted & spent)
     best_u = jnp.where(accepted, feet.u, feet.best_u)
     best_v = jnp.where(accepted, feet.v, feet.best_v)
-    moved = Feet(
+    moved = Feet.of(
         u=jnp.where(done, best_u, jnp.where(accepted, next_u, back_u)),
         v=jnp.where(done, best_v, jnp.where(accepted, next_v, back_v)),
         best_u=best_u,
@@ -92,31 +154,38 @@ def advance(
     return keep(feet.done, feet, moved)
 
 
-def propose(method: AbstractFootMethod, careful: bool) -> Callable[..., tuple[Array, Array, Array]]:
-    """The function that takes a step: next parameters, and the squared distance before it.
+def measure_at(method: AbstractFootMethod) -> Callable[..., Forms]:
+    """The function of parameters, targets, coefficients and box that gives the inner products there."""
 
-    A foot that has settled, or is held at its bounds, gets its own parameters back. Three results and no
-    more: the compiler evaluates the polynomials once for each. `careful` limits the step's length and sees
-    to it that it leads downhill.
-    """
-
-    def at(
-        u: Array, v: Array, target: list[Array], coefficients: Array, box: Box, tolerance: Array
-    ) -> tuple[Array, Array, Array]:
+    def at(u: Array, v: Array, target: list[Array], coefficients: Array, box: Box) -> Forms:
         s = (u - box.centre_u) / box.half_u
         t = (v - box.centre_v) / box.half_v
         jet = evaluate_jet(coefficients, s, t)
         e = [q - x for q, x in zip(target, jet.value, strict=True)]
-        first = measure(e, jet, method.drift)
+        return measure(e, jet, method.drift)
+
+    return at
+
+
+def next_trial(method: AbstractFootMethod, careful: bool) -> Callable[..., tuple[Array, Array]]:
+    """The function of inner products and parameters that takes a step.
+
+    A foot that has settled, or is held at its bounds, gets its own parameters back. `careful` limits the
+    step's length and sees to it that it leads downhill.
+    """
+
+    def after(
+        first: Forms, u: Array, v: Array, box: Box, tolerance: Array
+    ) -> tuple[Array, Array]:
         pinned_s, pinned_t, settled = _pins(first, u, v, box, tolerance)
         ds, dt = method.step(first, pinned_s, pinned_t)
         if careful:
             ds, dt = _downhill(first, u, v, ds, dt, pinned_s, pinned_t, box)
         next_u = jnp.clip(u + jnp.where(settled, 0.0, ds * box.half_u), box.low_u, box.high_u)
         next_v = jnp.clip(v + jnp.where(settled, 0.0, dt * box.half_v), box.low_v, box.high_v)
-        return next_u, next_v, first.f
+        return next_u, next_v
 
-    return at
+    return after
 
 
 def _downhill(
@@ -168,19 +237,6 @@ def _pins(
 
 def keep(which: Array, old: Feet, new: Feet) -> Feet:
     """`old` where `which`, `new` elsewhere."""
-    pairs = zip(_leaves(old), _leaves(new), strict=True)
-    return Feet(*(jnp.where(which, a, b) for a, b in pairs))
-
-
-def _leaves(feet: Feet) -> tuple[Array, ...]:
-    return (
-        feet.u,
-        feet.v,
-        feet.best_u,
-        feet.best_v,
-        feet.best,
-        feet.halvings,
-        feet.steps,
-        feet.done,
-        feet.converged,
+    return Feet(
+        jnp.where(which[None], old.real, new.real), jnp.where(which[None], old.whole, new.whole)
     )

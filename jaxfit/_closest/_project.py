@@ -1,6 +1,5 @@
 """From starting parameters to converged feet: the kernel every closest point and every fit calls."""
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
@@ -25,8 +24,10 @@ def project(
     tolerance: Array,
     max_steps: Array,
     idle: Bool[Array, " points"] | None = None,
+    borders: bool = True,
 ) -> Feet:
-    """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where they are.
+    """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
+    they are. With `borders`, feet that do not converge are looked for on the four border curves.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -41,6 +42,5 @@ def project(
         feet = sweep(method, pieces, target, u, v, idle, tolerance, noise)
     else:
         feet = new_feet(u, v)
-    leaves = jax.tree.leaves(feet)
-    feet = Feet(*leaves[:-2], feet.done | idle, feet.converged | idle)
-    return finish(method, pieces, target, feet, tolerance, noise, max_steps)
+    feet = feet.marked(feet.done | idle, feet.converged | idle)
+    return finish(method, pieces, target, feet, tolerance, noise, max_steps, borders)

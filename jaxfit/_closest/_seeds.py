@@ -1,27 +1,32 @@
 """Cold starts: where on the surface to begin looking, so that the foot found is the nearest of all.
 
-The surface is sampled a few times per cell. A foot at distance d can have a nearer rival elsewhere only if
-some sample is within sqrt(d^2 + 2 rho^2) of the point, rho being half the local sample spacing: the
-sample next to the rival. So every such sample that is not beside a foot already found is a start.
+The surface is sampled a few times per cell, on the knots too. A foot at distance d can have a nearer rival
+elsewhere only if the sample next to the rival, at most half a spacing (a, b) away, is close enough: the
+residual e of the rival is orthogonal to the tangents (along a crease or border, to the one that matters,
+for samples lie on those), so the squared distance of that sample exceeds the rival's by no more than
+|step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components only. Every sample this close that is
+not beside a foot already found is a start.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import evaluate_values
+from jaxfit._cells import Jet, evaluate_jet
 from jaxfit._splines._pieces import Axis, Pieces
 
 LEAST_SAMPLES = 24  # per direction, for surfaces of few cells
 MOST_SAMPLES = 400_000  # in all, for nets of very many cells
-SLACK = 2.0  # in rho^2
+SLACK = 2.0  # for steps along u and v that are not at right angles
+SAG = 1.5  # for second derivatives that change between samples
+WIDER = 2.0  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
-NEIGHBOURS, MORE_NEIGHBOURS = 8, 40
-MOST_ROUNDS = 6
+NEIGHBOURS = (8, 40, 200)  # as many as it takes
+LEAST_STARTS = 4  # tried although a sample beside them is nearer
 BLOCK = 2048
 
 
@@ -32,6 +37,7 @@ class Samples(NamedTuple):
     v: Float[Array, " b"]
     points: Float[Array, "a b d"]
     slack: Float[Array, "a b"]  # SLACK times the squared half spacing around each sample
+    sag: Float[Array, "a b"]  # SAG times the second-order normal part of a step, doubled
 
 
 def samples_per_cell(cells: int, across: int) -> int:
@@ -57,15 +63,32 @@ def sample(pieces: Pieces) -> Samples:
     shape = cell.shape
     coefficients = jnp.moveaxis(pieces.coefficients[cell], (0, 1), (-2, -1))
     s, t = jnp.broadcast_to(s[:, None], shape), jnp.broadcast_to(t[None, :], shape)
-    points = jnp.stack(evaluate_values(coefficients, s, t), axis=-1)
-    return Samples(u, v, points, 0.25 * SLACK * (_gap2(points, 0) + _gap2(points, 1)))
+    jet = evaluate_jet(coefficients, s, t)
+    points = jnp.stack(jet.value, axis=-1)
+    slack = 0.25 * SLACK * (_gap2(points, 0) + _gap2(points, 1))
+    return Samples(u, v, points, slack, SAG * _sag(jet, 1.0 / count_u, 1.0 / count_v))
 
 
 def _along(axis: Axis, count: int) -> Float[Array, " a"]:
-    share = (jnp.arange(count, dtype=axis.breaks.dtype) + 0.5) / count
+    share = jnp.arange(count, dtype=axis.breaks.dtype) / count
     low, width = axis.breaks[:-1, None], (axis.breaks[1:] - axis.breaks[:-1])[:, None]
-    inner = (low + width * share[None, :]).reshape(-1)
-    return jnp.concatenate([axis.breaks[:1], inner, axis.breaks[-1:]])
+    return jnp.append((low + width * share[None, :]).reshape(-1), axis.breaks[-1])
+
+
+def _sag(jet: Jet, a: float, b: float) -> Float[Array, "a b"]:
+    """|R_ss| a^2 + 2 |R_st| a b + |R_tt| b^2, of the components normal to the surface."""
+    s, t, *seconds = (jnp.stack(x, axis=-1) for x in jet[1:])
+    t = _without(t, s)
+    ss, st, tt = (jnp.linalg.norm(_without(_without(x, s), t), axis=-1) for x in seconds)
+    return ss * a**2 + 2.0 * st * a * b + tt * b**2
+
+
+def _without(x: Float[Array, "a b d"], along: Float[Array, "a b d"]) -> Float[Array, "a b d"]:
+    """The part of x at right angles to `along`, or x where that vanishes."""
+    square = jnp.sum(along * along, axis=-1, keepdims=True)
+    some = square > jnp.finfo(x.dtype).tiny
+    share = jnp.sum(x * along, axis=-1, keepdims=True) / jnp.where(some, square, 1.0)
+    return x - jnp.where(some, share, 0.0) * along
 
 
 def _gap2(points: Float[Array, "a b d"], axis: int) -> Float[Array, "a b"]:
@@ -86,73 +109,100 @@ class Search:
 
         self.u, self.v = np.asarray(samples.u), np.asarray(samples.v)
         cloud = np.asarray(samples.points, np.float64)
-        self.slack = np.asarray(samples.slack, np.float64).reshape(-1)
-        self.tree = KDTree(
-            cloud.reshape(-1, cloud.shape[-1]), balanced_tree=False, compact_nodes=False
-        )
+        self.cloud = cloud.reshape(-1, cloud.shape[-1])
+        self.slack, self.sag = (np.ravel(x) for x in (samples.slack, samples.sag))
+        self.tree = KDTree(self.cloud, balanced_tree=False, compact_nodes=False)
         self.points = points
-        self.count = min(NEIGHBOURS, self.tree.n)
-        self.distance, self.index = self._query(np.arange(len(points)), self.count)
+        self.distance, self.index = self._query(np.arange(len(points)), NEIGHBOURS[0])
 
     def _query(self, which: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        count = min(count, self.tree.n)
         distance, index = self.tree.query(self.points[which], k=count, workers=-1)
         return distance.reshape(-1, count), index.reshape(-1, count)
 
     def nearest(self) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of the nearest sample of every point."""
-        return self._parameters(self.index[:, 0])
+        return self.parameters(self.index[:, 0])
 
-    def _parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of samples given by number."""
         return self.u[index // self.v.size], self.v[index % self.v.size]
 
     def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
         """The samples that may lead to a foot nearer than those at (u, v)."""
-        limit = distance**2
-        last = self.index[:, -1]
-        crowded = np.flatnonzero(self.distance[:, -1] ** 2 <= limit + self.slack[last])
-        parts = []
-        calm = np.setdiff1d(np.arange(len(limit)), crowded, assume_unique=True)
-        for which, near, index in (
-            (calm, self.distance[calm], self.index[calm]),
-            (crowded, *self._query(crowded, min(MORE_NEIGHBOURS, self.tree.n))),
-        ):
-            open_ = near**2 <= limit[which, None] + self.slack[index]
-            some = open_.any(axis=1)
-            parts.append((which[some], index[some], open_[some]))
-        return Rivals(self, parts, u, v)
+        which = np.arange(len(distance))
+        near, index = self.distance, self.index
+        who, sample = [], []
+        for more in (*NEIGHBOURS[1:], None):
+            reach = distance[which, None]
+            open_ = near**2 <= reach**2 + self.slack[index] + reach * self.sag[index]
+            # Samples farther than the last are taken to have no more than WIDER times its slack.
+            wide, wide_sag = (
+                np.minimum(x.max(), WIDER * x[index].max(axis=1)) for x in (self.slack, self.sag)
+            )
+            crowded = near[:, -1] ** 2 <= distance[which] ** 2 + wide + distance[which] * wide_sag
+            crowded &= near.shape[1] < self.tree.n and more is not None
+            row, column = np.nonzero(open_ & ~crowded[:, None])
+            who.append(which[row])
+            sample.append(index[row, column])
+            which = which[crowded]
+            if not which.size:
+                break
+            near, index = self._query(which, more)
+        return Rivals(self, np.concatenate(who), np.concatenate(sample), u, v)
+
+    def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
+        """Whether none of the eight samples around `sample` is nearer to the point `who`."""
+        a, b = self.u.size, self.v.size
+        row, column = sample // b, sample % b
+        here = np.sum((self.cloud[sample] - self.points[who]) ** 2, axis=1)
+        low = np.ones(len(who), bool)
+        for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+            beside = np.clip(row + i, 0, a - 1) * b + np.clip(column + j, 0, b - 1)
+            low &= here <= np.sum((self.cloud[beside] - self.points[who]) ** 2, axis=1)
+        return low
 
 
 class Rivals:
-    """Samples still to be tried; shrinks with every foot that is found."""
+    """Pairs (point, sample) still to be tried, grouped by point, the most promising first."""
 
-    def __init__(self, search: Search, parts: list[Any], u: np.ndarray, v: np.ndarray):
-        self.search, self.parts = search, parts
+    def __init__(
+        self, search: Search, who: np.ndarray, sample: np.ndarray, u: np.ndarray, v: np.ndarray
+    ):
+        self.search, self.who, self.sample = search, who, sample
         self.found(u, v)
+        # Valleys of the samples first, and of the rest, which should lead to the same feet, only a few.
+        flank = ~search.is_valley(self.who, self.sample)
+        order = np.lexsort((flank, self.who))
+        self._keep(order)
+        flank = flank[order]
+        before = np.cumsum(flank) - flank
+        first = np.searchsorted(self.who, self.who)
+        self._keep(~flank | (before - before[first] < LEAST_STARTS))
+
+    def _keep(self, which: np.ndarray) -> None:
+        self.who, self.sample = self.who[which], self.sample[which]
 
     def found(self, u: np.ndarray, v: np.ndarray) -> None:
         """Drop the samples beside the feet at (u, v), which are given for all points."""
         search = self.search
-        row = np.interp(u, search.u, np.arange(search.u.size))
-        column = np.interp(v, search.v, np.arange(search.v.size))
-        left = []
-        for which, index, open_ in self.parts:
-            far_u = np.abs(index // search.v.size - row[which, None]) > BESIDE
-            far_v = np.abs(index % search.v.size - column[which, None]) > BESIDE
-            open_ = open_ & (far_u | far_v)
-            some = open_.any(axis=1)
-            left.append((which[some], index[some], open_[some]))
-        self.parts = left
+        row = np.interp(u[self.who], search.u, np.arange(search.u.size))
+        column = np.interp(v[self.who], search.v, np.arange(search.v.size))
+        far_u = np.abs(self.sample // search.v.size - row) > BESIDE
+        far_v = np.abs(self.sample % search.v.size - column) > BESIDE
+        self._keep(far_u | far_v)
 
-    def next(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points with a sample to try and its parameters; the sample counts as tried."""
-        points, starts = [], []
-        for which, index, open_ in self.parts:
-            first = open_.argmax(axis=1)
-            rows = np.arange(len(which))
-            starts.append(index[rows, first])
-            points.append(which)
-            open_[rows, first] = False
-        return np.concatenate(points), *self.search._parameters(np.concatenate(starts))
+    def first(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One start for each point that has any, taken off the list."""
+        first = np.ones(len(self.who), bool)
+        first[1:] = self.who[1:] != self.who[:-1]
+        who, sample = self.who[first], self.sample[first]
+        self._keep(~first)
+        return who, *self.search.parameters(sample)
+
+    def rest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All starts that are left."""
+        return self.who, *self.search.parameters(self.sample)
 
 
 def best_samples(

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import Rows, make_rows, row_width, staged
-from jaxfit._closest._feet import Box, Feet, propose
+from jaxfit._cells import Rows, row_coefficients, row_width, rows_of, staged
+from jaxfit._closest._feet import Box, Feet, measure_at, next_trial
 from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Pieces
 
@@ -87,9 +87,13 @@ def _advance(
 ) -> Plain:
     """One step of every foot that is on its way and in, or near, its row's cell."""
     always = tolerance < jnp.inf
-    step = propose(method, careful=False)
-    trial = staged(always, step, feet.u, feet.v, target, coefficients, box, tolerance)
-    next_u, next_v, f = trial
+
+    def propose(u: Array, v: Array) -> tuple[Array, Array, Array]:
+        # Three results and no more: the compiler evaluates the polynomials once for each.
+        first = measure_at(method)(u, v, target, coefficients, box)
+        return *next_trial(method, False)(first, u, v, box, tolerance), first.f
+
+    next_u, next_v, f = staged(always, propose, feet.u, feet.v)
     off_u = jnp.abs(feet.u - box.centre_u)
     off_v = jnp.abs(feet.v - box.centre_v)
     near = (off_u <= NEAR * box.half_u) & (off_v <= NEAR * box.half_v)
@@ -117,23 +121,7 @@ def _as_feet(pieces: Pieces, end: Plain, u: Array, v: Array, steps: Array) -> Fe
     u, v = jnp.where(arrived, end.u, u), jnp.where(arrived, end.v, v)
     best = jnp.where(arrived, end.f, jnp.inf)
     spent = jnp.full(u.shape, steps, jnp.int32)
-    return Feet(u, v, u, v, best, jnp.zeros_like(spent), spent, arrived, arrived)
-
-
-def rows_of(
-    pieces: Pieces, u: Array, v: Array, width: int, left_out: Bool[Array, " points"] | None = None
-) -> Rows:
-    """Rows for points with parameters (u, v), without those `left_out`."""
-    cells_v = pieces.axis_v.cells
-    cell = pieces.axis_u.locate(u) * cells_v + pieces.axis_v.locate(v)
-    if left_out is not None:
-        cell = jnp.where(left_out, pieces.cells, cell)
-    return make_rows(cell, pieces.cells, width)
-
-
-def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows 1"]:
-    """Every row's polynomial, ready to broadcast along the row."""
-    return jnp.moveaxis(pieces.coefficients[rows.cell], 0, -1)[..., None]
+    return Feet.of(u, v, u, v, best, jnp.zeros_like(spent), spent, arrived, arrived)
 
 
 def cell_box(pieces: Pieces, cell: Array) -> Box:

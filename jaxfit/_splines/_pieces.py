@@ -15,12 +15,16 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 
+FEW = 4096
+
+
 class Axis(eqx.Module):
     """One direction of the cells: break points, and the smooth stretches between creases.
 
     A crease is a knot of multiplicity order - 1 or more, where the tangent may jump. `low` and `high`
     bound the stretch without creases inside that a cell lies in; `first` and `last` are the cells at
-    the ends of that stretch.
+    the ends of that stretch. `ends` are the first and the last cell of positive width, `before` and
+    `after` the cells across the creases on either side (the cell itself at the ends of the domain).
     """
 
     breaks: Float[Array, " breaks"]
@@ -28,6 +32,9 @@ class Axis(eqx.Module):
     high: Float[Array, " cells"]
     first: Int[Array, " cells"]
     last: Int[Array, " cells"]
+    ends: Int[Array, "2"]
+    before: Int[Array, " cells"]
+    after: Int[Array, " cells"]
 
     @property
     def cells(self) -> int:
@@ -47,10 +54,21 @@ class Axis(eqx.Module):
 
     def locate(self, u: Float[Array, "..."]) -> Int[Array, "..."]:
         """Span with breaks[i] <= u < breaks[i+1]; the last non-empty one at the right end."""
-        first = jnp.searchsorted(self.breaks, self.breaks[0], side="right") - 1
-        last = jnp.searchsorted(self.breaks, self.breaks[-1], side="left") - 1
-        inner = jnp.searchsorted(self.breaks, u, side="right") - 1
-        return jnp.clip(inner, first, last).astype(jnp.int32)
+        if u.size <= FEW:  # comparing with all breaks is quick, and much quicker to compile
+            inner = jnp.sum(self.breaks.reshape((1,) * u.ndim + (-1,)) <= u[..., None], axis=-1) - 1
+        else:
+            inner = self._bisect(u)
+        return jnp.clip(inner, self.ends[0], self.ends[1]).astype(jnp.int32)
+
+    def _bisect(self, u: Float[Array, "..."]) -> Int[Array, "..."]:
+        # As jnp.searchsorted, without its care for NaN and signed zeros, which doubles the work.
+        found = jnp.zeros(u.shape, jnp.int32)
+        for bit in reversed(range(self.cells.bit_length())):
+            trial = found + (1 << bit)
+            inside = trial <= self.cells
+            passed = self.breaks[jnp.minimum(trial, self.cells)] <= u
+            found = jnp.where(inside & passed, trial, found)
+        return found
 
 
 class Pieces(eqx.Module):
@@ -65,6 +83,11 @@ class Pieces(eqx.Module):
         """Number of cells, empty ones included."""
         return self.coefficients.shape[0]
 
+    @property
+    def order(self) -> tuple[int, int]:
+        """Degree + 1 along u and along v."""
+        return self.coefficients.shape[2], self.coefficients.shape[3]
+
 
 def make_axis(knots: Float[Array, " knots"], order: int) -> Axis:
     """The spans of a knot vector's domain, with the smooth stretches they belong to."""
@@ -78,7 +101,14 @@ def make_axis(knots: Float[Array, " knots"], order: int) -> Axis:
     # The nearest crease to the left and to the right; empty spans neither start nor end a stretch.
     first = lax.cummax(jnp.where(crease[:-1] & filled, number, 0))
     last = lax.cummin(jnp.where(crease[1:] & filled, number, cells - 1), reverse=True)
-    return Axis(breaks, breaks[first], breaks[last + 1], first, last)
+    ends = jnp.stack([jnp.argmax(filled), cells - 1 - jnp.argmax(filled[::-1])]).astype(jnp.int32)
+    # The filled cell on the other side of a crease; empty spans may lie between.
+    left = lax.cummax(jnp.where(filled, number, -1))[jnp.maximum(first - 1, 0)]
+    right = lax.cummin(jnp.where(filled, number, cells), reverse=True)
+    right = right[jnp.minimum(last + 1, cells - 1)]
+    before = jnp.where(first > ends[0], left, number)
+    after = jnp.where(last < ends[1], right, number)
+    return Axis(breaks, breaks[first], breaks[last + 1], first, last, ends, before, after)
 
 
 def span_polynomials(knots: Float[Array, " knots"], order: int) -> Float[Array, "spans K K"]:

@@ -1,0 +1,70 @@
+"""Sums of basis functions over all points, onto the control net.
+
+Within a cell every basis function is a polynomial, so the sums over its points
+
+    sum_k w_k N_i(u_k) N_j(v_k) x_k
+
+are linear images of the moments sum_k w_k s_k^a t_k^b x_k. Moments are sums along a row; rows of
+one cell are added up, and the image is one fixed matrix per span and direction.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._cells._rows import Rows
+
+
+def net_sums(
+    rows: Rows,
+    s: Float[Array, "rows width"],
+    t: Float[Array, "rows width"],
+    values: Float[Array, "c rows width"],
+    poly_u: Float[Array, "spans_u K K"],
+    poly_v: Float[Array, "spans_v L L"],
+) -> Float[Array, "nu nv c"]:
+    """sum_k N_i(u_k) N_j(v_k) values_k for every control point, empty slots having values 0.
+
+    `poly_u`, `poly_v` are the basis functions as polynomials (`span_polynomials`).
+    """
+    moments = _row_moments(s, t, values, poly_u.shape[1], poly_v.shape[1])
+    spans_u, spans_v = poly_u.shape[0], poly_v.shape[0]
+    cells = jax.ops.segment_sum(moments, rows.cell, spans_u * spans_v, indices_are_sorted=True)
+    return _cells_to_net(cells, poly_u, poly_v)
+
+
+def _row_moments(
+    s: Array, t: Array, values: Array, order_u: int, order_v: int
+) -> Float[Array, "rows K L c"]:
+    # One broadcast product, summed along the row: a batched matrix product of these sizes is several times
+    # slower on a CPU, and a sum for each pair of powers takes long to compile.
+    powers_s, powers_t = _powers(s, order_u), _powers(t, order_v)
+    product = powers_s[:, None, None] * powers_t[None, :, None] * values[None, None]
+    return jnp.moveaxis(jnp.sum(product, axis=-1), -1, 0)
+
+
+def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order rows width"]:
+    powers = [jnp.ones_like(x)]
+    for _ in range(order - 1):
+        powers.append(powers[-1] * x)
+    return jnp.stack(powers)
+
+
+def _cells_to_net(
+    moments: Float[Array, "cells K L c"],
+    poly_u: Float[Array, "spans_u K K"],
+    poly_v: Float[Array, "spans_v L L"],
+) -> Float[Array, "nu nv c"]:
+    (spans_u, order_u, _), (spans_v, order_v, _) = poly_u.shape, poly_v.shape
+    c = moments.shape[-1]
+    x = moments.reshape(spans_u, spans_v, order_u, order_v, c)
+    image = partial(jnp.einsum, precision="highest")
+    x = image("ira,jsb,ijabc->rsijc", poly_u, poly_v, x)
+    net = jnp.zeros((spans_u + order_u - 1, spans_v + order_v - 1, c), moments.dtype)
+    for r in range(order_u):
+        for q in range(order_v):
+            net = net.at[r : r + spans_u, q : q + spans_v].add(x[r, q])
+    return net

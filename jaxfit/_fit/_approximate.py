@@ -1,0 +1,233 @@
+"""The verb for scattered points: a surface near all of them, from a base surface."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit._base import Boundary, base_surface
+from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._closest import closest_point
+from jaxfit._fit._fit_result import Fit, history_of, outcome
+from jaxfit._fit._geometric_approximation import GeometricApproximation, border
+from jaxfit._fit._loop import Carry, Limits, begin, run
+from jaxfit._fit._problem import Problem, Unit, make_problem, padded_start, unit_of
+from jaxfit._precision import advise_x64
+from jaxfit._splines import BSplineSurface
+
+LEAST_POINTS = 4
+POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
+MOST_CONTROL_POINTS = 64  # per direction, likewise
+
+
+def approximate(
+    points: ArrayLike,
+    base: BSplineSurface,
+    method: GeometricApproximation | None = None,
+    tol_average: float | None = 6e-4,
+    tol_maximum: float | None = None,
+    max_steps: int = 200,
+    weights: ArrayLike | None = None,
+    start: tuple[ArrayLike, ArrayLike] | None = None,
+    progress: Callable[[int, int, float, float], None] | None = None,
+    throw: bool = False,
+) -> Fit:
+    """A surface on the net and the knots of `base` that comes close to a cloud of points.
+
+    Parameters
+    ----------
+    points : array (points, d)
+        In any order, any unit.
+    base : BSplineSurface
+        A first approximation, for instance from `base_surface`. Its knots are kept.
+    method : GeometricApproximation, optional
+    tol_average, tol_maximum : float or None
+        The fit has converged when the average and the maximum error are at most these fractions of the
+        diagonal of the data's bounding box; None asks for nothing. Default: 6e-4 (the paper's 0.06 %) on
+        average.
+    max_steps : int
+        Most iterations.
+    weights : array (points,), optional
+        Non-negative; how much each point pulls. Errors are not weighted.
+    start : pair of arrays (points,), optional
+        Feet (u, v) on the base surface to start from; default the closest points, searched globally.
+    progress : callable, optional
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+    throw : bool
+        Raise a RuntimeError with the reason instead of returning a fit that has not converged.
+
+    Returns
+    -------
+    Fit
+        Errors are distances to true closest points: outside transformations the feet are looked for
+        globally once more at the end. The iteration itself, and its history, follow local feet.
+
+    Raises
+    ------
+    ValueError
+        If points, weights or start have the wrong shape or are not finite, there are fewer than four
+        points, or all of them coincide.
+
+    Notes
+    -----
+    Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
+    differentiation. Outside transformations clouds are padded to one of eight sizes per octave, so that a
+    second cloud of similar size compiles nothing.
+    """
+    method = GeometricApproximation() if method is None else method
+    points = as_points("points", points, base.dimension, least=LEAST_POINTS)
+    weights = _checked_weights(weights, points.shape[0])
+    for tolerance in (tol_average, tol_maximum):
+        if tolerance is not None and is_concrete(tolerance):
+            advise_x64(float(tolerance), np.dtype(base.control_points.dtype))
+    unit = unit_of(points)
+    if start is None:
+        feet = closest_point(base, points)
+        start = (feet.u, feet.v)
+    else:
+        start = _checked_start(start, points.shape[0])
+    problem = make_problem(points, weights, base, unit, method.foot_tolerance)
+    dtype, size = problem.target.dtype, problem.target.shape[1]
+    net = jnp.asarray(unit.inward(base.control_points), dtype)
+    u, v = (padded_start(x, size, dtype) for x in start)
+    bounds = (jnp.inf if x is None else x for x in (tol_average, tol_maximum))
+    limits = Limits(*(jnp.asarray(x, dtype) for x in bounds), jnp.asarray(max_steps, jnp.int32))
+    concrete = is_concrete(points, base, start)
+    carry = begin(net, u, v, max_steps)
+    carry = run(method, problem, limits, carry, progress if concrete else None)
+    surface = _surface(carry, base, unit, method)
+    return _finished(carry, problem, points, unit, surface, concrete, throw)
+
+
+def _surface(
+    carry: Carry, base: BSplineSurface, unit: Unit, method: GeometricApproximation
+) -> BSplineSurface:
+    """The fitted surface in the user's unit; control points that never move keep every bit."""
+    moved = jnp.asarray(unit.outward(carry.net), base.control_points.dtype)
+    nu, nv = base.shape
+    held = border(nu, nv, corners_only=not method.fixed_boundary)[..., None]
+    net = jnp.where(held, base.control_points, moved)
+    return BSplineSurface(net, base.knots_u, base.knots_v)
+
+
+def _finished(
+    carry: Carry,
+    problem: Problem,
+    points: Any,
+    unit: Unit,
+    surface: BSplineSurface,
+    concrete: bool,
+    throw: bool,
+) -> Fit:
+    count = points.shape[0]
+    measured = carry.measured
+    u, v = measured.u[:count], measured.v[:count]
+    errors = measured.error[:count] / problem.diagonal
+    lost = ~measured.found[:count]
+    if concrete:
+        # Feet were followed locally; another part of the surface may have come nearer meanwhile.
+        best = closest_point(surface, points)
+        nearer = best.converged & (best.distance / unit.diagonal < errors * (1 - 1e-6))
+        u, v = jnp.where(nearer, best.u, u), jnp.where(nearer, best.v, v)
+        errors = jnp.where(nearer, (best.distance / unit.diagonal).astype(errors.dtype), errors)
+        lost = lost & ~nearer
+    return Fit(
+        surface=surface,
+        u=u,
+        v=v,
+        errors=errors,
+        average_error=jnp.mean(errors),
+        maximum_error=jnp.max(errors),
+        history=history_of(carry),
+        result=outcome(carry, throw),
+        stats={
+            "num_steps": carry.step,
+            "diagonal": unit.diagonal,
+            "unconverged_feet": jnp.sum(lost),
+        },
+    )
+
+
+def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
+    if weights is None:
+        return None
+    weights = as_floating("weights", weights, 1)
+    if weights.shape[0] != count:
+        raise ValueError(
+            f"weights must hold one number for each of the {count} points, but has shape "
+            f"{weights.shape}; give both the same length."
+        )
+    if is_concrete(weights) and (np.asarray(weights).min() < 0 or not np.asarray(weights).any()):
+        raise ValueError(
+            "weights must not be negative and not all zero; give each point a weight of 0 or more."
+        )
+    return weights
+
+
+def _checked_start(start: Any, count: int) -> tuple[Any, Any]:
+    if not isinstance(start, (tuple, list)) or len(start) != 2:
+        raise ValueError("start must be a pair (u, v) of parameter arrays; pass start=(u, v).")
+    u, v = (as_floating(f"start {name}", x, 1) for name, x in zip("uv", start, strict=True))
+    if u.shape[0] != count or v.shape[0] != count:
+        raise ValueError(
+            f"start must hold a u and a v for each of the {count} points, but their shapes are "
+            f"{u.shape} and {v.shape}; give one pair per point."
+        )
+    return u, v
+
+
+def fit_points(
+    points: ArrayLike,
+    boundary: Boundary | None = None,
+    net: tuple[int, int] | None = None,
+    order: tuple[int, int] = (4, 4),
+    method: GeometricApproximation | None = None,
+    **options: Any,
+) -> Fit:
+    """The whole way from a cloud and its four boundary polylines to a fitted surface.
+
+    Parameters
+    ----------
+    points : array (points, d)
+    boundary : Boundary
+        The four sides of the patch.
+    net : (nu, nv), optional
+        Control points along u and v. Default: about one for every eight points, shared between the
+        directions by the lengths of the sides, at most 64 each.
+    order : (K, L)
+        Degree + 1 along u and v.
+    method, options
+        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    ValueError
+        As `base_surface` and `approximate` do, and if there is no boundary.
+    """
+    if boundary is None:
+        raise ValueError(
+            "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
+            "four polylines around the patch."
+        )
+    points = as_points("points", points, least=LEAST_POINTS)
+    net = _default_net(points.shape[0], boundary, order) if net is None else net
+    base = base_surface(boundary, points, net=net, order=order)
+    return approximate(points, base, method, **options)
+
+
+def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:
+    sides = (boundary.v0, boundary.v1, boundary.u0, boundary.u1)
+    lengths = [np.linalg.norm(np.diff(np.asarray(x), axis=0), axis=1).sum() for x in sides]
+    ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
+    root = np.sqrt(max(count / POINTS_PER_CONTROL_POINT, 1.0))
+    wanted = (round(root * ratio), round(root / ratio))
+    nu, nv = (
+        int(np.clip(n, 2 * k, MOST_CONTROL_POINTS)) for n, k in zip(wanted, order, strict=True)
+    )
+    return nu, nv

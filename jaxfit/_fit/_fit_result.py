@@ -1,0 +1,88 @@
+"""What every fit returns."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._checks import is_concrete
+from jaxfit._fit._loop import Carry, result_of
+from jaxfit._fit._results import RESULTS
+from jaxfit._splines import BSplineSurface
+
+
+class History(eqx.Module):
+    """Errors on the surface of every iteration, the first one included; fractions of the diagonal.
+
+    Inside a transformation, where the number of iterations is not known, the arrays have room for more
+    and end in NaN.
+    """
+
+    average: Float[Array, " steps"]
+    maximum: Float[Array, " steps"]
+
+
+class Fit(eqx.Module):
+    """A fitted surface, and an honest account of how well it fits.
+
+    Attributes
+    ----------
+    surface : BSplineSurface
+    u, v : array (points,), or (n, m) for a grid
+        Parameters of the foot point of every data point.
+    errors : array (points,), or (n, m) for a grid
+        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box.
+    average_error, maximum_error : float arrays ()
+        Of `errors`.
+    history : History
+        Average and maximum error of every iteration.
+    result : item of RESULTS
+        Why the fit stopped; `converged` and `message` say it as a boolean and as a sentence.
+    stats : dict
+        `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
+        foot was not found to the tolerance.
+    """
+
+    surface: BSplineSurface
+    u: Float[Array, "..."]
+    v: Float[Array, "..."]
+    errors: Float[Array, "..."]
+    average_error: Float[Array, ""]
+    maximum_error: Float[Array, ""]
+    history: History
+    result: Any
+    stats: dict[str, Any]
+
+    @property
+    def converged(self) -> Any:
+        """Whether all tolerances are met."""
+        return self.result == RESULTS.converged
+
+    @property
+    def message(self) -> str:
+        """Why the fit stopped, in a sentence."""
+        return RESULTS[self.result]
+
+
+def history_of(carry: Carry) -> History:
+    """The recorded errors, cut to the iterations made where that number is known."""
+    if is_concrete(carry):
+        end = int(carry.step) + 1
+        return History(np.asarray(carry.average)[:end], np.asarray(carry.maximum)[:end])
+    return History(carry.average, carry.maximum)
+
+
+def outcome(carry: Carry, throw: bool) -> Any:
+    """The result; raises its sentence instead if `throw` and the fit has not converged."""
+    result = result_of(carry.code)
+    if throw and is_concrete(carry):
+        if not bool(result == RESULTS.converged):
+            raise RuntimeError(f"the fit did not converge: {RESULTS[result]}")
+    elif throw:
+        _, result = eqx.error_if(
+            (carry.net, result), result != RESULTS.converged, "the fit did not converge."
+        )
+    return jax.tree.map(lambda x: x, result)

@@ -1,0 +1,132 @@
+"""The verb for grids: a surface through all of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit._checks import as_floating, is_concrete
+from jaxfit._fit._fit_result import Fit, history_of, outcome
+from jaxfit._fit._geometric_interpolation import GeometricInterpolation
+from jaxfit._fit._loop import Limits, begin, run
+from jaxfit._fit._problem import make_problem, unit_of
+from jaxfit._parameters import grid_parameters
+from jaxfit._precision import advise_x64
+from jaxfit._splines import BSplineSurface, averaging_knots
+
+DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
+
+
+def interpolate(
+    grid: ArrayLike,
+    method: GeometricInterpolation | None = None,
+    order: tuple[int, int] = (4, 4),
+    tolerance: float | None = None,
+    max_steps: int = 1000,
+    progress: Callable[[int, int, float, float], None] | None = None,
+    throw: bool = False,
+) -> Fit:
+    """A B-spline surface with one control point per grid point, through every grid point.
+
+    Parameters
+    ----------
+    grid : array (n, m, d)
+        Any unit; at least `order` points in each direction.
+    method : GeometricInterpolation, optional
+    order : (K, L)
+        Degree + 1 along the first and the second index, each 2 to 8.
+    tolerance : float, optional
+        The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
+        1e-12 in float64, 2e-6 in float32.
+    max_steps : int
+        Most iterations.
+    progress : callable, optional
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+    throw : bool
+        Raise a RuntimeError with the reason instead of returning a fit that has not converged.
+
+    Returns
+    -------
+    Fit
+        `u`, `v` and `errors` have the shape (n, m) of the grid.
+
+    Raises
+    ------
+    ValueError
+        If the grid has the wrong shape, too few points, entries that are not finite, or no extent.
+
+    Notes
+    -----
+    Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
+    differentiation. On a closed grid (first row equal to the last) the feet stay on their side of the seam.
+    """
+    grid = _checked_grid(grid, order)
+    method = GeometricInterpolation() if method is None else method
+    n, m, d = grid.shape
+    unit = unit_of(grid.reshape(-1, d))
+    inner = unit.inward(grid)
+    parameters = grid_parameters(inner, method.parametrisation)
+    knots = [averaging_knots(t, k) for t, k in zip(parameters[:2], order, strict=True)]
+    net = jnp.asarray(inner)
+    surface = BSplineSurface(net, *knots)
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE[np.dtype(surface.control_points.dtype).name]
+    elif is_concrete(tolerance):
+        advise_x64(float(tolerance), np.dtype(surface.control_points.dtype))
+    # The net fixes the size of the problem, so its points are not padded.
+    cloud = grid.reshape(-1, d)
+    problem = make_problem(cloud, None, surface, unit, method.foot_tolerance, padded=False)
+    dtype = problem.target.dtype
+    u = jnp.repeat(parameters.u.astype(dtype), m)
+    v = jnp.tile(parameters.v.astype(dtype), n)
+    limits = Limits(
+        jnp.asarray(jnp.inf, dtype), jnp.asarray(tolerance, dtype), jnp.asarray(max_steps, jnp.int32)
+    )
+    carry = begin(surface.control_points.astype(dtype), u, v, max_steps)
+    carry = run(method, problem, limits, carry, progress if is_concrete(grid) else None)
+    return _finished(carry, problem, unit, grid, surface, throw)
+
+
+def _finished(
+    carry: Any, problem: Any, unit: Any, grid: Any, surface: BSplineSurface, throw: bool
+) -> Fit:
+    n, m, _ = grid.shape
+    measured = carry.measured
+    # Corners are never moved: they are the data, to the last bit.
+    points = unit.outward(np.asarray(carry.net) if is_concrete(carry) else carry.net)
+    points = jnp.asarray(points)
+    for i, j in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
+        points = points.at[i, j].set(jnp.asarray(grid[i, j], points.dtype))
+    average, maximum = problem.summarise(measured.error)
+    return Fit(
+        surface=BSplineSurface(points, surface.knots_u, surface.knots_v),
+        u=measured.u.reshape(n, m),
+        v=measured.v.reshape(n, m),
+        errors=(measured.error / problem.diagonal).reshape(n, m),
+        average_error=average,
+        maximum_error=maximum,
+        history=history_of(carry),
+        result=outcome(carry, throw),
+        stats={
+            "num_steps": carry.step,
+            "diagonal": unit.diagonal,
+            "unconverged_feet": jnp.sum(~measured.found),
+        },
+    )
+
+
+def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
+    grid = as_floating("grid", grid, 3)
+    n, m, d = grid.shape
+    if len(order) != 2 or not all(2 <= k <= 8 for k in order):
+        raise ValueError(f"order must be a pair (K, L) of numbers from 2 to 8, but is {order}.")
+    if n < order[0] or m < order[1] or d < 1:
+        raise ValueError(
+            f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
+            f"shape {grid.shape}; give more points or lower the order."
+        )
+    return grid
+
+

@@ -1,0 +1,113 @@
+"""A fitting problem in its own unit: centred, the diagonal near 1, padded to a common size."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._checks import is_concrete
+from jaxfit._precision import bucket, working_dtype
+from jaxfit._splines import BSplineSurface
+
+
+class Problem(eqx.Module):
+    """Points to fit, and what stays fixed while the net moves. Lengths in units of `scale`."""
+
+    target: Float[Array, "d points"]
+    weight: Float[Array, " points"]
+    knots_u: Float[Array, " knots_u"]
+    knots_v: Float[Array, " knots_v"]
+    padding: Float[Array, " points"]  # 1 for a point, 0 for what only fills up the size
+    diagonal: Float[Array, ""]
+    foot_tolerance: Float[Array, ""]
+
+    def summarise(self, error: Float[Array, " points"]) -> tuple[Array, Array]:
+        """Average and maximum error of the true points, as fractions of the diagonal."""
+        error = jnp.where(self.padding > 0, error, 0.0) / self.diagonal
+        return jnp.sum(error) / jnp.sum(self.padding), jnp.max(error)
+
+
+class Unit(eqx.Module):
+    """The change of unit x -> (x - centre) / scale. The scale is a power of two, so it rounds nothing."""
+
+    centre: Any
+    scale: Any
+    diagonal: Any  # of the data's bounding box, in the user's unit
+
+    def inward(self, x: Any) -> Any:
+        """Into the problem's unit. Concrete data is centred in double precision whatever the session's."""
+        if is_concrete(x, self.centre):
+            return (np.asarray(x, np.float64) - self.centre) / self.scale
+        return (x - _like(self.centre, x)) / self.scale
+
+    def outward(self, x: Any) -> Any:
+        """Back into the user's unit."""
+        if is_concrete(x, self.centre):
+            return np.asarray(x, np.float64) * self.scale + self.centre
+        return x * self.scale + _like(self.centre, x)
+
+
+def _like(centre: Any, x: Any) -> Any:
+    return jnp.asarray(centre, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))
+
+
+def unit_of(points: Any) -> Unit:
+    """The unit of a cloud (points, d): the middle of its box, and about its diagonal.
+
+    Raises ValueError if all points coincide.
+    """
+    if is_concrete(points):
+        points = np.asarray(points, np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
+        diagonal = float(np.linalg.norm(high - low))
+        if not diagonal > 0:
+            raise ValueError(
+                "points must not all coincide, but their bounding box has no extent; give distinct points."
+            )
+        return Unit(0.5 * (low + high), 2.0 ** round(np.log2(diagonal)), diagonal)
+    low, high = jnp.min(points, axis=0), jnp.max(points, axis=0)
+    diagonal = jnp.linalg.norm(high - low)
+    scale = jnp.where(diagonal > 0, jnp.exp2(jnp.round(jnp.log2(diagonal))), 1.0)
+    return Unit(0.5 * (low + high), scale, diagonal)
+
+
+def make_problem(
+    points: Any,
+    weights: Any,
+    surface: BSplineSurface,
+    unit: Unit,
+    foot_tolerance: float,
+    padded: bool = True,
+) -> Problem:
+    """Points in the problem's unit, padded to their bucket where they are concrete."""
+    concrete = is_concrete(points, weights)
+    count = points.shape[0]
+    dtype = working_dtype() if concrete else jnp.result_type(points, float)
+    inner = unit.inward(points)
+    size = bucket(count) if concrete and padded else count
+    xp: Any = np if concrete else jnp
+    if size > count:
+        inner = np.concatenate([inner, np.repeat(inner[-1:], size - count, axis=0)])
+    real = (np.arange(size) < count).astype(dtype)
+    weight = real if weights is None else xp.pad(xp.asarray(weights), (0, size - count))
+    return Problem(
+        target=jnp.asarray(inner.T, dtype),
+        weight=jnp.asarray(weight, dtype),
+        knots_u=jnp.asarray(surface.knots_u, dtype),
+        knots_v=jnp.asarray(surface.knots_v, dtype),
+        padding=jnp.asarray(real, dtype),
+        diagonal=jnp.asarray(unit.diagonal / unit.scale, dtype),
+        foot_tolerance=jnp.asarray(foot_tolerance, dtype),
+    )
+
+
+def padded_start(x: Any, size: int, dtype: Any) -> Array:
+    """Starting parameters, repeated at the end up to the size of the problem."""
+    count = x.shape[0]
+    if size == count:
+        return jnp.asarray(x, dtype)
+    x = np.asarray(x)
+    return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], size - count)]), dtype)

@@ -1,0 +1,22 @@
+"""How a fit can end: an enumeration whose values are the sentences that users read."""
+
+import equinox as eqx
+
+
+class RESULTS(eqx.Enumeration):
+    """Why a fit stopped. Compare with `fit.result == RESULTS.converged`."""
+
+    running = "the fit has not finished."
+    converged = "all tolerances are met."
+    max_steps_reached = (
+        "the maximum number of iterations was reached before the tolerances were met; raise max_steps "
+        "or loosen the tolerances."
+    )
+    stalled = (
+        "the errors have stopped falling above the tolerances; use a larger net (more control points), a "
+        "better base surface, or looser tolerances."
+    )
+    diverged = (
+        "the iteration produced numbers that are not finite or errors that grow, and was taken back to the "
+        "last good surface; check the base surface and the scale of the data."
+    )

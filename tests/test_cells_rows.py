@@ -1,0 +1,68 @@
+"""Every point sits in exactly one slot of a row of its cell."""
+
+import helpers
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxfit._cells import make_rows, row_width
+
+POINTS, CELLS = 60, 9
+
+
+def assert_rows(cell, cells, width):
+    rows = make_rows(cell, cells, width)
+    point, taking_part = np.asarray(rows.point), np.flatnonzero(cell < cells)
+    count, width_of_rows = point.shape
+    assert width_of_rows == width
+    assert count <= len(cell) // width + min(cells, len(cell))
+    filled = np.asarray(rows.filled)
+    np.testing.assert_array_equal(np.sort(point[filled]), taking_part)
+    assert (point[~filled] == len(cell)).all()
+    owner = np.broadcast_to(np.asarray(rows.cell)[:, None], point.shape)
+    np.testing.assert_array_equal(owner[filled], cell[point[filled]])
+    slot = np.asarray(rows.slot_of_point)[taking_part]
+    np.testing.assert_array_equal(point.reshape(-1)[slot], taking_part)
+    return rows
+
+
+@given(st.lists(st.integers(0, CELLS), min_size=POINTS, max_size=POINTS))
+def test_every_point_has_one_slot_in_a_row_of_its_cell(cell):
+    assert_rows(np.array(cell, np.int32), CELLS, 8)
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("case", ["all in the first", "all in the last", "none", "one each"])
+def test_lopsided_clouds_fit_the_bounded_number_of_rows(case):
+    cell = {
+        "all in the first": np.zeros(POINTS),
+        "all in the last": np.full(POINTS, CELLS - 1),
+        "none": np.full(POINTS, CELLS),
+        "one each": np.arange(POINTS) % CELLS,
+    }[case]
+    assert_rows(cell.astype(np.int32), CELLS, 8)
+
+
+@pytest.mark.float32_too
+def test_words_too_long_to_pack_are_sorted_all_the_same():
+    # 2^20 cells and 2^13 points need 33 bits: a 64-bit word, or without x64 a sort with a payload.
+    cells = (1 << 20) - 1
+    cell = np.random.default_rng(0).integers(0, cells, (1 << 13) - 1).astype(np.int32)
+    assert_rows(cell, cells, 8)
+
+
+@pytest.mark.float32_too
+def test_spread_and_gather_are_inverse():
+    cell = np.random.default_rng(0).integers(0, CELLS, POINTS).astype(np.int32)
+    rows = assert_rows(cell, CELLS, 8)
+    x = np.random.default_rng(1).normal(size=(2, POINTS)).astype(type(helpers.eps()))
+    there = rows.spread(np.asarray(x, rows.spread(np.asarray(x)).dtype))
+    assert np.isfinite(there).all()
+    np.testing.assert_array_equal(rows.gather(there), np.asarray(x, there.dtype))
+
+
+def test_rows_get_wider_with_more_points_in_a_cell():
+    widths = [row_width(n, 100) for n in (10, 1_000, 10_000, 1_000_000)]
+    assert widths == sorted(widths)
+    assert set(widths) <= {8, 16, 32}

@@ -1,0 +1,83 @@
+"""Polynomial pieces are the surface, derivative by derivative."""
+
+import helpers
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfit._cells import evaluate_jet, evaluate_values
+from jaxfit._splines import BSplineCurve, BSplineSurface
+from jaxfit._splines._pieces import as_surface_arrays, make_axis, make_pieces
+
+PARTIALS = {"value": (0, 0), "s": (1, 0), "t": (0, 1), "ss": (2, 0), "st": (1, 1), "tt": (0, 2)}
+
+
+def jet_at(pieces, u, v):
+    """The jet at (u, v), its derivatives turned into those by u and v."""
+    axes = (pieces.axis_u, pieces.axis_v)
+    i, j = (axis.locate(x) for axis, x in zip(axes, (u, v), strict=True))
+    s = (u - axes[0].centre[i]) / axes[0].half[i]
+    t = (v - axes[1].centre[j]) / axes[1].half[j]
+    cell = jnp.moveaxis(pieces.coefficients[i * axes[1].cells + j], 0, -1)
+    jet = evaluate_jet(cell, s, t)._asdict()
+    value = np.stack(evaluate_values(cell, s, t), axis=-1)
+    np.testing.assert_array_equal(value, np.stack(jet["value"], axis=-1))
+    scale = {"s": axes[0].half[i], "t": axes[1].half[j]}
+    result = {}
+    for name, parts in jet.items():
+        by = np.prod([scale[x] for x in name], axis=0) if name != "value" else np.ones(len(u))
+        result[name] = np.stack(parts, axis=-1) / by[:, None]
+    return result
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("repeats", [0, 3])
+@pytest.mark.parametrize("order", [(2, 3), (4, 4), (6, 5), (8, 7)])
+def test_pieces_equal_the_surface_and_its_derivatives(order, repeats):
+    surface = helpers.random_surface(order, repeats=repeats)
+    pieces = make_pieces(surface.control_points, surface.knots_u, surface.knots_v)
+    u, v = helpers.parameters_on_knots(surface)
+    actual = jet_at(pieces, u, v)
+    tolerance = 4.0 ** max(order) * helpers.eps()
+    for name, partial in PARTIALS.items():
+        expected = np.asarray(surface.derivative(u, v, *partial))
+        # Narrow spans have large derivatives: judge by the largest.
+        np.testing.assert_allclose(
+            actual[name], expected, rtol=0, atol=tolerance * max(1.0, np.abs(expected).max())
+        )
+
+
+def test_knots_of_full_multiplicity_give_both_sides_their_own_polynomial():
+    knots = np.array([0, 0, 0, 0.4, 0.4, 0.4, 1, 1, 1.0])
+    surface = BSplineSurface(np.random.default_rng(0).normal(size=(6, 6, 2)), knots, knots)
+    pieces = make_pieces(surface.control_points, knots, knots)
+    u, v = np.array([0.4, 0.4 - 1e-12, 1.0]), np.array([0.4, 0.2, 0.4])
+    assert np.isfinite(pieces.coefficients).all()
+    np.testing.assert_allclose(jet_at(pieces, u, v)["value"], surface(u, v), atol=1e-10)
+
+
+def test_unused_control_points_of_a_fixed_capacity_net_change_nothing():
+    surface = helpers.wavy_surface()
+    net = np.concatenate([surface.control_points, np.full((3, 6, 3), 9.0)])
+    knots = np.concatenate([surface.knots_u, np.ones(3)])
+    pieces = make_pieces(jnp.asarray(net), jnp.asarray(knots), surface.knots_v)
+    u, v = np.random.default_rng(1).uniform(size=(2, 20))
+    u[0] = v[0] = 1.0
+    np.testing.assert_allclose(jet_at(pieces, u, v)["value"], surface(u, v), atol=1e-14)
+
+
+def test_a_curve_is_a_surface_of_one_cell_across():
+    curve = BSplineCurve(np.random.default_rng(0).normal(size=(7, 2)), helpers.clamped_uniform(7, 4))
+    pieces = make_pieces(*as_surface_arrays(curve))
+    u = np.linspace(0, 1, 13)
+    actual = jet_at(pieces, u, np.zeros(13))
+    np.testing.assert_allclose(actual["value"], curve(u), atol=1e-14)
+    np.testing.assert_allclose(actual["s"], curve.derivative(u), atol=1e-12)
+    assert not actual["t"].any()
+
+
+def test_stretches_end_at_creases_only():
+    knots = jnp.asarray([0, 0, 0, 0.2, 0.5, 0.5, 0.8, 1, 1, 1])  # order 3: a crease at 0.5
+    axis = make_axis(knots, 3)
+    stretch = np.stack([axis.low, axis.high], axis=1)[axis.locate(jnp.asarray([0.1, 0.3, 0.5, 1]))]
+    np.testing.assert_array_equal(stretch, [[0, 0.5], [0, 0.5], [0.5, 1], [0.5, 1]])
