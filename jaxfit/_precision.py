@@ -34,7 +34,7 @@ def advise_x64(tolerance: float, dtype: np.dtype) -> None:
 
 
 def bucket(count: int, least: int = 64) -> int:
-    """The next of eight sizes an octave, so that nearby sizes share one compilation."""
+    """The next of four sizes an octave, so that nearby sizes share one compilation."""
     count = max(count, least)
-    step = 1 << max(count.bit_length() - 4, 0)
+    step = 1 << max(count.bit_length() - 3, 0)
     return -(-count // step) * step

@@ -111,7 +111,7 @@ def closest_point(
     half the squared distance; a coordinate held at a border does not move, and where $H$ is singular
     (centres of curvature) the derivative is set to zero.
 
-    Outside transformations sizes are padded to one of eight per octave, so that clouds of similar size
+    Outside transformations sizes are padded to one of four per octave, so that clouds of similar size
     share one compilation.
     """
     method = Newton() if method is None else method
@@ -225,7 +225,7 @@ def _on_host(
         jnp.asarray(max_steps, jnp.int32),
     )
 
-    def feet_from(which: Any, u: np.ndarray, v: np.ndarray) -> dict[str, np.ndarray]:
+    def feet_from(which: Any, u: ArrayLike, v: ArrayLike) -> dict[str, np.ndarray]:
         """Feet of the points `which`, from (u, v); always the same shapes."""
         target = jnp.asarray(_padded(centred[which], size).T.astype(dtype))
         starts = (jnp.asarray(_padded(np.asarray(x), size).astype(dtype)) for x in (u, v))

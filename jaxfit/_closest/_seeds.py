@@ -25,7 +25,7 @@ SLACK = 2.0  # for steps along u and v that are not at right angles
 SAG = 1.5  # for second derivatives that change between samples
 WIDER = 2.0  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
-NEIGHBOURS = (8, 40, 200)  # as many as it takes
+NEIGHBOURS = (16, 60, 200)  # as many as it takes
 LEAST_STARTS = 4  # tried although a sample beside them is nearer
 BLOCK = 2048
 

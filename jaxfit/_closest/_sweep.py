@@ -4,6 +4,8 @@ Only the plain case is handled here: steps that do what they should. A foot whos
 does not settle, goes back to its start and is left to the safeguarded iteration of `_blocks`.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,7 +65,7 @@ def sweep(
         rows = rows_of(pieces, feet.u, feet.v, width, feet.state != ON_ITS_WAY)
         box, coefficients, here, there = staged(always, _lay_out, pieces, rows, target, feet)
 
-        def inner(_: int, x: Plain) -> Plain:
+        def inner(_: Any, x: Plain) -> Plain:
             return _advance(method, x, here, coefficients, box, tolerance, noise)
 
         there = lax.fori_loop(0, STEPS_PER_SWEEP, inner, there)
@@ -71,7 +73,8 @@ def sweep(
         kept = feet.state != ON_ITS_WAY
         return count + 1, jax.tree.map(lambda a, b: jnp.where(kept, a, b), feet, back)
 
-    begin = Plain(u, v, jnp.full_like(u, jnp.inf), jnp.where(idle, LEFT_OUT, ON_ITS_WAY))
+    state = jnp.where(idle, LEFT_OUT, ON_ITS_WAY).astype(jnp.int32)
+    begin = Plain(u, v, jnp.full_like(u, jnp.inf), state)
     count, end = lax.while_loop(unfinished, body, (jnp.asarray(0, jnp.int32), begin))
     return _as_feet(pieces, end, u, v, count * STEPS_PER_SWEEP)
 
@@ -102,7 +105,7 @@ def _advance(
     judged = inside & (feet.state == ON_ITS_WAY)
     worse = f > feet.f + noise * (2.0 * jnp.sqrt(f) + noise)
     still = (next_u == feet.u) & (next_v == feet.v)
-    after = jnp.where(worse, LEFT_OUT, jnp.where(still, ARRIVED, ON_ITS_WAY))
+    after = jnp.where(worse, LEFT_OUT, jnp.where(still, ARRIVED, ON_ITS_WAY)).astype(jnp.int32)
     return Plain(
         jnp.where(goes, next_u, feet.u),
         jnp.where(goes, next_v, feet.v),

@@ -30,7 +30,7 @@ def approximate(
     tol_maximum: float | None = None,
     max_steps: int = 200,
     weights: ArrayLike | None = None,
-    start: tuple[ArrayLike, ArrayLike] | None = None,
+    start: Any = None,
     progress: Callable[[int, int, float, float], None] | None = None,
     throw: bool = False,
 ) -> Fit:
@@ -73,7 +73,7 @@ def approximate(
     Notes
     -----
     Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
-    differentiation. Outside transformations clouds are padded to one of eight sizes per octave, so that a
+    differentiation. Outside transformations clouds are padded to one of four sizes per octave, so that a
     second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
@@ -121,33 +121,39 @@ def _finished(
     concrete: bool,
     throw: bool,
 ) -> Fit:
-    count = points.shape[0]
     measured = carry.measured
-    u, v = measured.u[:count], measured.v[:count]
-    errors = measured.error[:count] / problem.diagonal
-    lost = ~measured.found[:count]
+    parts = (measured.u, measured.v, measured.error / problem.diagonal, measured.found)
     if concrete:
-        # Feet were followed locally; another part of the surface may have come nearer meanwhile.
-        best = closest_point(surface, points)
-        nearer = best.converged & (best.distance / unit.diagonal < errors * (1 - 1e-6))
-        u, v = jnp.where(nearer, best.u, u), jnp.where(nearer, best.v, v)
-        errors = jnp.where(nearer, (best.distance / unit.diagonal).astype(errors.dtype), errors)
-        lost = lost & ~nearer
+        parts = _nearest_of_all(parts, points, unit, surface)
+    u, v, errors, found = (jnp.asarray(x) for x in parts)
+    xp = np if concrete else jnp  # NumPy compiles nothing for a new size
     return Fit(
         surface=surface,
         u=u,
         v=v,
         errors=errors,
-        average_error=jnp.mean(errors),
-        maximum_error=jnp.max(errors),
+        average_error=jnp.asarray(xp.mean(parts[2])),
+        maximum_error=jnp.asarray(xp.max(parts[2])),
         history=history_of(carry),
         result=outcome(carry, throw),
         stats={
             "num_steps": carry.step,
             "diagonal": unit.diagonal,
-            "unconverged_feet": jnp.sum(lost),
+            "unconverged_feet": xp.sum(~parts[3]),
         },
     )
+
+
+def _nearest_of_all(parts: Any, points: Any, unit: Unit, surface: BSplineSurface) -> Any:
+    """Feet were followed locally; where another part of the surface has come nearer, take that."""
+    count = points.shape[0]
+    u, v, errors, found = (np.array(x)[:count] for x in parts)
+    best = closest_point(surface, points)
+    distance = np.asarray(best.distance) / unit.diagonal
+    nearer = np.asarray(best.converged) & ((distance < errors * (1 - 1e-6)) | ~found)
+    for old, new in ((u, best.u), (v, best.v), (errors, distance), (found, best.converged)):
+        old[nearer] = np.asarray(new)[nearer]
+    return u, v, errors, found
 
 
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:

@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -71,7 +72,9 @@ def history_of(carry: Carry) -> History:
     """The recorded errors, cut to the iterations made where that number is known."""
     if is_concrete(carry):
         end = int(carry.step) + 1
-        return History(np.asarray(carry.average)[:end], np.asarray(carry.maximum)[:end])
+        # Cut by NumPy: by JAX, every new length would be a new compilation.
+        cut = (jnp.asarray(np.asarray(x)[:end]) for x in (carry.average, carry.maximum))
+        return History(*cut)
     return History(carry.average, carry.maximum)
 
 

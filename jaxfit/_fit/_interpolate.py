@@ -9,6 +9,7 @@ from jax.typing import ArrayLike
 
 from jaxfit._checks import as_floating, is_concrete
 from jaxfit._fit._fit_result import Fit, history_of, outcome
+from jaxfit._fit._geometric_approximation import border
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._loop import Limits, begin, run
 from jaxfit._fit._problem import make_problem, unit_of
@@ -97,8 +98,8 @@ def _finished(
     # Corners are never moved: they are the data, to the last bit.
     points = unit.outward(np.asarray(carry.net) if is_concrete(carry) else carry.net)
     points = jnp.asarray(points)
-    for i, j in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
-        points = points.at[i, j].set(jnp.asarray(grid[i, j], points.dtype))
+    corners = border(*points.shape[:2], corners_only=True)[..., None]
+    points = jnp.where(corners, jnp.asarray(grid, points.dtype), points)
     average, maximum = problem.summarise(measured.error)
     return Fit(
         surface=BSplineSurface(points, surface.knots_u, surface.knots_v),

@@ -1,0 +1,197 @@
+"""Without a start the foot found is the nearest of all."""
+
+import closest_reference
+import helpers
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxfit import BSplineCurve, BSplineSurface, HuWallner, PointStatus, closest_point
+
+COUNT = 512  # one size for nearly all queries: few compilations
+
+
+def queries(surface, count=COUNT, seed=0):
+    """Points 1 to 5 % of the diagonal off the surface, on both sides, and where they came from."""
+    rng = np.random.default_rng(seed)
+    (a, b), (c, d) = np.asarray(surface.domain)
+    u, v = rng.uniform(a, b, count), rng.uniform(c, d, count)
+    height = rng.choice([-1, 1], count) * rng.uniform(0.01, 0.05, count)
+    height *= helpers.diagonal(surface.control_points)
+    return np.asarray(surface(u, v)) + height[:, None] * np.asarray(surface.normal(u, v)), u, v
+
+
+def assert_nearest(spline, points, tolerance=1e-9, **options):
+    feet = closest_point(spline, points, **options)
+    size = helpers.diagonal(np.concatenate([points, spline.control_points.reshape(-1, points.shape[1])]))
+    surface = closest_reference.ruled(spline) if isinstance(spline, BSplineCurve) else spline
+    expected = closest_reference.nearest_distance(surface, points)
+    assert feet.converged.all()
+    assert np.max(np.asarray(feet.distance) - expected) <= tolerance * size
+    at = spline(feet.u) if feet.v is None else spline(feet.u, feet.v)
+    np.testing.assert_allclose(feet.point, at, rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(
+        feet.distance, np.linalg.norm(points - at, axis=1), rtol=0, atol=1e-12 * size
+    )
+    return feet
+
+
+@pytest.fixture(scope="module")
+def wavy():
+    net = helpers.wavy_net(16, 14, height=0.3)
+    return BSplineSurface(net, helpers.clamped_uniform(16, 4), helpers.clamped_uniform(14, 4))
+
+
+def test_feet_of_points_off_a_wavy_surface_are_nearest(wavy):
+    points, _, _ = queries(wavy)
+    feet = assert_nearest(wavy, points)
+    circle = closest_point(wavy, points, method=HuWallner())
+    assert circle.converged.all()
+    np.testing.assert_allclose(circle.distance, feet.distance, rtol=0, atol=1e-12)
+
+
+def test_feet_of_points_far_away_and_all_around_are_nearest(wavy):
+    far = np.random.default_rng(1).uniform(-3, 4, (COUNT, 3))
+    feet = assert_nearest(wavy, far)
+    status, u, v = (np.asarray(x) for x in (feet.status, feet.u, feet.v))
+    on_sides = ((u == 0) | (u == 1)).astype(int) + ((v == 0) | (v == 1))
+    np.testing.assert_array_equal(status, on_sides)
+    assert {PointStatus.INTERIOR, PointStatus.BORDER, PointStatus.CORNER} == set(status.tolist())
+    assert (np.asarray(feet.steps) > 0).all()
+
+
+def test_points_in_rows_get_the_feet_of_points_in_blocks(wavy):
+    points, _, _ = queries(wavy, 4608)
+    rows, blocks = closest_point(wavy, points), closest_point(wavy, points[:COUNT])
+    assert rows.converged.all()
+    for name in ("u", "v", "distance"):
+        np.testing.assert_allclose(getattr(rows, name)[:COUNT], getattr(blocks, name), atol=1e-9)
+    assert np.max(np.asarray(rows.distance[:COUNT] - blocks.distance)) <= 1e-12
+
+
+@pytest.mark.parametrize("name", ["blade_wrap_3000", "mannequin_head"])
+def test_feet_on_folded_base_surfaces_of_scans_are_nearest(name):
+    from jaxfit._base import Boundary, base_surface
+
+    data = helpers.data(name)
+    sides = Boundary(*(data[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
+    net = (24, 40) if name == "blade_wrap_3000" else (42, 42)
+    base = base_surface(sides, data["points"], net=net)
+    near, _, _ = queries(base, 1500)
+    assert_nearest(base, np.concatenate([data["points"][::4], near])[:2000])
+
+
+def test_creases_and_full_breaks_do_not_stop_the_search():
+    # Order 2 in u, and in v (order 3) one knot of multiplicity 2 and a jump: multiplicity 3.
+    rng = np.random.default_rng(0)
+    net = helpers.wavy_net(9, 10, height=0.3) + 0.02 * rng.normal(size=(9, 10, 3))
+    knots_v = np.array([0, 0, 0, 0.2, 0.4, 0.4, 0.7, 0.7, 0.7, 0.9, 1, 1, 1])
+    surface = BSplineSurface(net, helpers.clamped_uniform(9, 2), knots_v)
+    assert_nearest(surface, rng.uniform(-0.3, 1.3, (COUNT, 3)))
+
+
+def test_a_closed_surface_has_feet_on_both_sides_of_its_seam():
+    angle = np.linspace(0, 2 * np.pi, 16)
+    x, y = 1.0 / np.cos(np.pi / 15) * np.stack([np.cos(angle), np.sin(angle)])
+    net = np.stack([np.stack([x, y, np.full(16, z)], -1) for z in np.linspace(0, 2, 14)], 1)
+    surface = BSplineSurface(net, helpers.clamped_uniform(16, 4), helpers.clamped_uniform(14, 4))
+    rng = np.random.default_rng(2)
+    spread = rng.normal(size=COUNT) * 0.05
+    points = np.stack([rng.uniform(0.8, 1.5, COUNT), spread, rng.uniform(0, 2, COUNT)], -1)
+    feet = assert_nearest(surface, points)
+    assert (np.asarray(feet.u) < 0.1).any()
+    assert (np.asarray(feet.u) > 0.9).any()
+
+
+def test_a_pole_has_feet_and_no_nan():
+    net = helpers.wavy_net(16, 14)
+    net[:, 0] = [0.5, -0.2, 0.3]
+    surface = BSplineSurface(net, helpers.clamped_uniform(16, 4), helpers.clamped_uniform(14, 4))
+    points = np.array([0.5, -0.2, 0.3]) + 0.2 * np.random.default_rng(0).normal(size=(COUNT, 3))
+    points[0] = [0.5, -0.2, 0.3]
+    assert_nearest(surface, points)
+
+
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_any_dimension(d):
+    rng = np.random.default_rng(d)
+    net = np.concatenate([helpers.wavy_net(7, 6), 0.2 * rng.normal(size=(7, 6, 2))], axis=-1)
+    surface = BSplineSurface(
+        net[..., :d], helpers.clamped_uniform(7, 4), helpers.clamped_uniform(6, 4)
+    )
+    points = rng.uniform(-0.2, 1.2, (COUNT, d))
+    assert_nearest(surface, points)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_curves(order):
+    rng = np.random.default_rng(order)
+    curve = BSplineCurve(rng.uniform(size=(12, 2)), helpers.clamped_uniform(12, order))
+    feet = assert_nearest(curve, rng.uniform(-0.3, 1.3, (COUNT, 2)))
+    assert feet.v is None
+
+
+def test_a_long_thin_surface_and_coordinates_in_the_millions(wavy):
+    thin = wavy.affine(np.diag([50.0, 1.0, 1.0]))
+    assert_nearest(thin, queries(thin)[0])
+    moved = wavy.affine(np.diag([300.0, 300.0, 300.0]), np.array([5.1e5, 5.4e6, 100.0]))
+    # Only nine digits are left below the diagonal; feet are as good as the coordinates are.
+    assert_nearest(moved, queries(moved)[0])
+
+
+def test_starts_near_the_feet_give_the_same_feet(wavy):
+    points, _, _ = queries(wavy)
+    cold = closest_point(wavy, points)
+    shift = np.random.default_rng(0).uniform(-0.003, 0.003, (2, COUNT))
+    warm = closest_point(wavy, points, start=(cold.u + shift[0], cold.v + shift[1]))
+    assert warm.converged.all()
+    same = np.isclose(warm.distance, cold.distance, rtol=0, atol=1e-12)
+    assert same.mean() > 0.98  # points at a centre of curvature have two feet close together
+    assert (np.asarray(warm.distance - cold.distance) > -1e-12).all()
+
+
+@pytest.mark.parametrize("method", [None, HuWallner()])
+@given(st.integers(0, 10_000))
+def test_a_foot_is_never_farther_than_its_start(wavy, method, seed):
+    rng = np.random.default_rng(seed)
+    points, start = rng.uniform(-0.5, 1.5, (64, 3)), rng.uniform(size=(2, 64))
+    feet = closest_point(wavy, points, start=tuple(start), method=method, max_steps=20)
+    before = np.linalg.norm(points - wavy(*start), axis=1)
+    assert (np.asarray(feet.distance) <= before + 1e-14).all()
+    u, v = np.asarray(feet.u), np.asarray(feet.v)
+    assert ((u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)).all()
+
+
+def test_too_few_steps_are_reported(wavy):
+    points, _, _ = queries(wavy)
+    feet = closest_point(wavy, points, start=(np.zeros(COUNT), np.zeros(COUNT)), max_steps=1)
+    lost = ~np.asarray(feet.converged)
+    assert lost.any()
+    np.testing.assert_array_equal(np.asarray(feet.status) == PointStatus.NOT_CONVERGED, lost)
+    assert np.isfinite(feet.distance).all()
+
+
+@pytest.mark.float32_too
+def test_feet_reach_the_working_precision():
+    surface = helpers.wavy_surface(8, 8)
+    points, _, _ = queries(surface, 64)
+    points = jnp.asarray(points)
+    feet = closest_point(surface, points)
+    assert feet.converged.all()
+    assert feet.distance.dtype == points.dtype
+    expected = closest_reference.nearest_distance(surface, np.asarray(points))
+    assert np.max(np.asarray(feet.distance) - expected) <= 50 * helpers.eps()
+
+
+@pytest.mark.float32_too
+def test_a_second_cloud_of_nearby_size_compiles_nothing():
+    surface = helpers.wavy_surface(8, 8)
+    points, u, v = queries(surface, 64)
+    jax.block_until_ready([closest_point(surface, points), closest_point(surface, points, (u, v))])
+    with helpers.count_compilations() as compiled:
+        closest_point(surface, points[:61])
+        closest_point(surface, points[:61], (u[:61], v[:61]), tolerance=1e-4, max_steps=30)
+    assert compiled.count == 0

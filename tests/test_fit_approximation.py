@@ -1,0 +1,209 @@
+"""Algorithm 1, plain: each step is the paper's, errors are true distances, and nothing is NaN."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations, data, eps, grid_edges, wavy_cloud, wavy_surface
+from scipy.interpolate import BSpline
+
+import jaxfit as jf
+
+POINTS, EDGES = wavy_cloud(500)
+BOUNDARY = jf.Boundary(**EDGES)
+
+
+@pytest.fixture(scope="module")
+def base():
+    return jf.base_surface(BOUNDARY, net=(8, 7))
+
+
+def design(knots, count, u):
+    """Dense matrix of basis functions, by SciPy; the right end belongs to the last span."""
+    knots, u = np.asarray(knots), np.minimum(np.asarray(u), 1 - 1e-16)
+    return np.stack([BSpline(knots, row, 3)(u) for row in np.eye(count)], axis=1)
+
+
+def one_step(points, surface, weights=None):
+    """Algorithm 1 in plain NumPy: (num / den, den) at the true feet."""
+    feet = jf.closest_point(surface, points)
+    nu, nv = surface.shape
+    a = design(surface.knots_u, nu, feet.u)[:, :, None] * design(surface.knots_v, nv, feet.v)[:, None]
+    a = a if weights is None else a * weights[:, None, None]
+    den = a.sum(axis=0)
+    num = np.einsum("kij,kc->ijc", a, points - np.asarray(feet.point))
+    return np.where(den[..., None] > 0, num / np.where(den > 0, den, 1)[..., None], 0), den
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_one_step_is_algorithm_1(base, weighted):
+    weights = np.random.default_rng(1).uniform(0.1, 3, 500) if weighted else None
+    fit = jf.approximate(POINTS, base, max_steps=1, tol_average=1e-9, weights=weights)
+    shift, _ = one_step(POINTS, base, weights)
+    shift[[0, -1]] = shift[:, [0, -1]] = 0
+    expected = np.asarray(base.control_points) + shift
+    assert np.abs(np.asarray(fit.surface.control_points) - expected).max() < 1e-12
+
+
+def test_a_free_boundary_moves_all_but_the_corners(base):
+    method = jf.GeometricApproximation(fixed_boundary=False)
+    fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
+    shift, _ = one_step(POINTS, base)
+    shift[[0, 0, -1, -1], [0, -1, 0, -1]] = 0
+    expected = np.asarray(base.control_points) + shift
+    assert np.abs(np.asarray(fit.surface.control_points) - expected).max() < 1e-12
+
+
+@pytest.mark.float32_too
+def test_a_smooth_cloud_is_met_and_errors_are_distances_to_closest_points(base):
+    fit = jf.approximate(POINTS, base, tol_average=6e-4)
+    assert bool(fit.converged), fit.message
+    assert float(fit.average_error) <= 6e-4
+    feet = jf.closest_point(fit.surface, POINTS)
+    distance = np.asarray(feet.distance) / fit.stats["diagonal"]
+    assert np.abs(np.asarray(fit.errors) - distance).max() < 100 * eps() + 1e-9
+    assert float(fit.maximum_error) == float(np.max(np.asarray(fit.errors)))
+    assert int(fit.stats["unconverged_feet"]) == 0
+    assert fit.history.average[-1] < 0.2 * fit.history.average[0]
+
+
+def test_held_and_untouched_control_points_keep_every_bit(base):
+    surface = base.affine(np.eye(3), np.array([0.1, 0.2, 0.3]))
+    some = POINTS[(POINTS[:, 0] < 0.3) & (POINTS[:, 1] < 0.4)] + np.array([0.1, 0.2, 0.3])
+    fit = jf.approximate(some, surface, max_steps=3, tol_average=1e-9)
+    before, after = np.asarray(surface.control_points), np.asarray(fit.surface.control_points)
+    for held in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        assert (before[held] == after[held]).all()
+    far = np.s_[-3:, -3:]
+    assert np.abs(before[far] - after[far]).max() < 1e-15
+    assert np.abs(before - after).max() > 1e-4
+
+
+def test_points_of_weight_zero_do_not_pull(base):
+    outlier = np.concatenate([POINTS, [[0.5, 0.5, 3.0]]])
+    weights = np.r_[np.ones(500), 0.0]
+    options = dict(max_steps=4, tol_average=1e-9)
+    with_it = jf.approximate(outlier, base, weights=weights, **options)
+    without = jf.approximate(POINTS, base, **options)
+    difference = with_it.surface.control_points - without.surface.control_points
+    assert np.abs(np.asarray(difference)).max() < 1e-12
+    assert float(with_it.maximum_error) > 0.5
+
+
+def test_the_order_of_the_points_does_not_matter(base):
+    options = dict(max_steps=5, tol_average=1e-9)
+    mixed = jf.approximate(POINTS[::-1], base, **options)
+    plain = jf.approximate(POINTS, base, **options)
+    difference = mixed.surface.control_points - plain.surface.control_points
+    assert np.abs(np.asarray(difference)).max() < 1e-12
+    assert np.abs(np.asarray(mixed.errors)[::-1] - np.asarray(plain.errors)).max() < 1e-12
+
+
+def test_motion_and_scale_of_the_problem_move_and_scale_the_fit(base):
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    matrix, offset = 250.0 * turn, np.array([5e5, -3e5, 1e4])
+    options = dict(max_steps=5, tol_average=1e-9)
+    plain = jf.approximate(POINTS, base, **options).surface.affine(matrix, offset)
+    moved = jf.approximate(POINTS @ matrix.T + offset, base.affine(matrix, offset), **options)
+    difference = np.asarray(moved.surface.control_points) - np.asarray(plain.control_points)
+    assert np.abs(difference).max() < 1e-9 * 250 * 1.5
+
+
+def test_samples_of_the_surface_leave_it_as_it_is():
+    surface = wavy_surface(7, 6)
+    u, v = np.random.default_rng(5).random((2, 300))
+    fit = jf.approximate(np.asarray(surface(u, v)), surface, tol_average=1e-12)
+    assert bool(fit.converged), fit.message
+    assert int(fit.stats["num_steps"]) == 0
+    assert np.abs(np.asarray(fit.surface.control_points - surface.control_points)).max() < 1e-15
+
+
+def test_a_tolerance_out_of_reach_ends_as_stalled(base):
+    rough = POINTS + 0.01 * np.random.default_rng(2).normal(size=POINTS.shape)
+    fit = jf.approximate(rough, base, tol_average=1e-9, max_steps=2000)
+    assert fit.result == jf.RESULTS.stalled
+    assert not bool(fit.converged)
+    assert int(fit.stats["num_steps"]) < 2000
+
+
+def test_jit_and_vmap_give_the_same_as_a_plain_call(base):
+    def net(points, surface):
+        fit = jf.approximate(points, surface, max_steps=3, tol_average=1e-9)
+        return fit.surface.control_points, fit.average_error
+
+    plain, average = net(POINTS, base)
+    inside, inside_average = jax.jit(net)(jnp.asarray(POINTS), base)
+    assert np.abs(np.asarray(inside - plain)).max() < 1e-12
+    assert abs(float(inside_average - average)) < 1e-12
+    clouds = jnp.stack([jnp.asarray(POINTS), jnp.asarray(POINTS) * jnp.asarray([[1, 1, 0.5]])])
+    both, _ = jax.vmap(lambda points: net(points, base))(clouds)
+    assert np.abs(np.asarray(both[0] - plain)).max() < 1e-12
+    assert np.abs(np.asarray(both[1] - net(np.asarray(clouds[1]), base)[0])).max() < 1e-12
+
+
+def test_a_forward_derivative_is_that_of_the_iteration_as_run(base):
+    def height(scale):
+        points = jnp.asarray(POINTS) * jnp.stack([1.0, 1.0, scale])[None, :]
+        return jf.approximate(points, base, max_steps=2, tol_average=1e-9).surface(0.4, 0.6)[2]
+
+    slope = jax.jvp(height, (1.0,), (1.0,))[1]
+    difference = (float(height(1 + 1e-5)) - float(height(1 - 1e-5))) / 2e-5
+    assert abs(float(slope) - difference) < 1e-6
+
+
+def test_a_second_cloud_of_similar_size_compiles_nothing(base):
+    jf.approximate(POINTS, base, max_steps=5)
+    with count_compilations() as compiled:
+        jf.approximate(POINTS[:-10], base, max_steps=7, tol_average=3e-4)
+    assert compiled.count == 0
+
+
+def test_the_whole_way_from_a_cloud_with_its_boundary():
+    fit = jf.fit_points(POINTS, BOUNDARY, tol_average=1e-3)
+    assert bool(fit.converged), fit.message
+    same = jf.fit_points(POINTS, BOUNDARY, net=(8, 7), tol_average=1e-3)
+    assert same.surface.shape == (8, 7)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"points": np.where(POINTS == POINTS[7], np.nan, POINTS)}, "points must be finite"),
+        ({"points": POINTS[:, :2]}, "points must have 3 coordinates"),
+        ({"points": POINTS[:3]}, "points must hold at least 4 points"),
+        ({"points": np.ones((9, 3))}, "must not all coincide"),
+        ({"weights": np.ones(3)}, "weights must hold one number for each"),
+        ({"weights": -np.ones(500)}, "weights must not be negative"),
+        ({"start": (np.zeros(3), np.zeros(3))}, "start must hold a u and a v for each"),
+        ({"start": np.zeros(500)}, "start must be a pair"),
+    ],
+)
+def test_bad_input_gets_a_sentence(base, change, sentence):
+    arguments = {"points": POINTS, "base": base} | change
+    with pytest.raises(ValueError, match=sentence):
+        jf.approximate(**arguments)
+
+
+def test_a_cloud_without_a_boundary_gets_a_sentence():
+    with pytest.raises(ValueError, match="boundary must be given"):
+        jf.fit_points(POINTS)
+
+
+@pytest.mark.parametrize(
+    ("name", "net", "average"),
+    [("igea_face", (42, 42), 1.5e-3), ("mountain", (42, 42), 3e-3)],
+)
+def test_real_scans_are_fitted_from_their_boundaries(name, net, average):
+    arrays = data(name)
+    sides = {key[-2:]: arrays[key] for key in arrays if key.startswith("boundary_")}
+    fit = jf.fit_points(arrays["points"], jf.Boundary(**sides), net=net, max_steps=15)
+    assert float(fit.average_error) < average
+    assert fit.history.average[-1] < fit.history.average[0]
+    assert np.isfinite(np.asarray(fit.surface.control_points)).all()
+
+
+def test_a_grid_taken_as_a_cloud():
+    grid = data("fran_face_45x49")["grid"]
+    boundary = jf.Boundary(**grid_edges(grid))
+    fit = jf.fit_points(grid.reshape(-1, 3), boundary, net=(20, 20), max_steps=30)
+    assert float(fit.average_error) < 2e-3

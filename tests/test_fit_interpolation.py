@@ -1,0 +1,147 @@
+"""Plain geometric interpolation: it passes through the grid, and says so only when it does."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations, data, diagonal, eps, wavy_grid
+
+import jaxfit as jf
+
+GRID = wavy_grid(8, 7)
+
+
+def tube(n, m):
+    angle = np.linspace(0, 2 * np.pi, n)[:, None]
+    x = np.linspace(0, 3, m)[None, :]
+    parts = np.broadcast_arrays(x, np.cos(angle) * (1 + 0.1 * x), np.sin(angle))
+    grid = np.stack(parts, axis=-1)
+    grid[-1] = grid[0]
+    return grid
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("order", [(4, 4), (3, 5)])
+def test_the_surface_passes_through_every_grid_point(order):
+    fit = jf.interpolate(GRID, order=order)
+    assert bool(fit.converged), fit.message
+    assert float(fit.maximum_error) <= (1e-12 if eps() < 1e-10 else 2e-6)
+    there = np.asarray(fit.surface(fit.u, fit.v))
+    assert np.abs(there - GRID).max() <= 50 * eps() + 2 * float(fit.maximum_error) * diagonal(GRID)
+    assert fit.errors.shape == fit.u.shape == GRID.shape[:2]
+    assert fit.surface.order == order
+
+
+def test_corners_are_the_data_to_the_last_bit():
+    net = np.asarray(jf.interpolate(GRID + 0.1).surface.control_points)
+    for i, j in ((0, 0), (0, -1), (-1, 0), (-1, -1)):
+        assert (net[i, j] == (GRID + 0.1)[i, j]).all()
+
+
+def test_one_step_is_equations_13_and_14():
+    fit = jf.interpolate(GRID, max_steps=1)
+    parameters = jf.grid_parameters(GRID)
+    knots = [jf.averaging_knots(t, 4) for t in parameters[:2]]
+    first = jf.BSplineSurface(GRID, *knots)
+    u, v = (x.reshape(-1) for x in np.meshgrid(parameters.u, parameters.v, indexing="ij"))
+    feet = jf.closest_point(first, GRID.reshape(-1, 3), start=(u, v))
+    error = (GRID.reshape(-1, 3) - np.asarray(feet.point)).reshape(GRID.shape)
+    error[[0, 0, -1, -1], [0, -1, 0, -1]] = 0
+    assert np.abs(np.asarray(fit.surface.control_points) - GRID - error).max() < 1e-12
+    assert not bool(fit.converged)
+    assert "maximum number" in fit.message
+
+
+def test_history_falls_from_the_first_surface_to_the_last():
+    fit = jf.interpolate(GRID)
+    steps = int(fit.stats["num_steps"])
+    assert len(fit.history.maximum) == len(fit.history.average) == steps + 1
+    assert fit.history.maximum[-1] == float(fit.maximum_error)
+    assert fit.history.average[0] > 1e3 * fit.history.average[-1]
+
+
+def test_a_closed_grid_has_no_seam():
+    grid = tube(13, 8)
+    fit = jf.interpolate(grid)
+    assert bool(fit.converged), fit.message
+    v = np.linspace(0, 1, 30)
+    ends = [np.asarray(fit.surface(np.full(30, u), v)) for u in (0.0, 1.0)]
+    assert np.abs(ends[0] - ends[1]).max() < 1e-10
+
+
+@pytest.mark.parametrize("parametrisation", [jf.ChordLength(), jf.Centripetal()])
+def test_far_from_the_origin_and_in_any_unit(parametrisation):
+    method = jf.GeometricInterpolation(parametrisation)
+    here = jf.interpolate(GRID, method)
+    away = jf.interpolate(1000 * GRID + np.array([5e6, 4e5, 100.0]), method, tolerance=1e-10)
+    assert bool(away.converged), away.message
+    back = (np.asarray(away.surface.control_points) - np.array([5e6, 4e5, 100.0])) / 1000
+    assert np.abs(back - np.asarray(here.surface.control_points)).max() < 1e-8
+
+
+@pytest.mark.parametrize("case", ["repeated row", "collinear", "uneven"])
+def test_hostile_grids_end_with_finite_numbers_and_a_reason(case):
+    grid = GRID.copy()
+    if case == "repeated row":
+        grid[3] = grid[2]
+    elif case == "collinear":
+        grid = (grid[..., :1] + 0.1 * grid[..., 1:2]) * np.array([1.0, 2.0, 3.0])
+    else:
+        x = np.cumsum(np.r_[0, np.tile([1.0, 1e-3], 4)])[:8]
+        grid[..., 0] = (x / x[-1])[:, None]
+    fit = jf.interpolate(grid, max_steps=300)
+    assert np.isfinite(np.asarray(fit.surface.control_points)).all()
+    assert np.isfinite(float(fit.maximum_error))
+    assert bool(fit.converged) == (float(fit.maximum_error) <= 1e-12)
+
+
+def test_jit_and_vmap_give_the_same_as_a_plain_call():
+    def net(grid):
+        return jf.interpolate(grid, tolerance=1e-9).surface.control_points
+
+    plain = np.asarray(net(GRID))
+    assert np.abs(np.asarray(jax.jit(net)(jnp.asarray(GRID))) - plain).max() < 1e-12
+    both = jax.vmap(net)(jnp.stack([jnp.asarray(GRID), jnp.asarray(2 * GRID[::-1])]))
+    assert np.abs(np.asarray(both[0]) - plain).max() < 1e-12
+    assert np.abs(np.asarray(both[1]) - np.asarray(net(2 * GRID[::-1]))).max() < 1e-12
+
+
+def test_progress_reports_and_changes_nothing():
+    seen = []
+    watched = jf.interpolate(GRID, progress=lambda *report: seen.append(report))
+    alone = jf.interpolate(GRID)
+    assert (np.asarray(watched.surface.control_points) == alone.surface.control_points).all()
+    assert seen[-1][0] == int(alone.stats["num_steps"])
+    assert seen[-1][3] == float(alone.maximum_error)
+
+
+def test_a_second_grid_of_the_same_shape_compiles_nothing():
+    jf.interpolate(GRID)
+    with count_compilations() as compiled:
+        jf.interpolate(GRID[::-1] * 2)
+    assert compiled.count == 0
+
+
+def test_throw_raises_the_reason():
+    with pytest.raises(RuntimeError, match="maximum number of iterations"):
+        jf.interpolate(GRID, max_steps=2, throw=True)
+
+
+@pytest.mark.parametrize(
+    ("grid", "sentence"),
+    [
+        (np.where(GRID == GRID[3, 3], np.nan, GRID), "grid must be finite"),
+        (GRID[:3], "grid must have at least 4 x 4 points"),
+        (GRID[..., 0], "grid must have 3 dimensions"),
+        (np.ones((5, 5, 3)), "must not all coincide"),
+    ],
+)
+def test_bad_grids_get_a_sentence(grid, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jf.interpolate(grid)
+
+
+def test_a_hood_is_met_to_rounding():
+    fit = jf.interpolate(data("hood_beetle_10x10")["grid"])
+    assert bool(fit.converged), fit.message
+    assert float(fit.maximum_error) <= 1e-12
