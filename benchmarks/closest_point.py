@@ -100,9 +100,7 @@ def split(surface, points, start, runs):
     target = jax.numpy.asarray(centred.T)
     begin = tuple(jax.device_put(x) for x in start)
     tolerance = jax.numpy.asarray(1e-12 * extent(arrays[0], points))
-    kernel = jax.jit(
-        lambda q, u, v: project(Newton(), prepared.pieces, q, u, v, tolerance, np.int32(60))
-    )
+    kernel = jax.jit(lambda q, u, v: project(Newton(), prepared.pieces, q, u, v, tolerance, np.int32(60)))
     *times, feet = timed(lambda: kernel(target, *begin), runs)
     line("  projection, warm", count, *times, f"{float(feet.steps.mean()):.1f} steps on average")
     *times, search = timed(lambda: Search(prepared.samples, centred), runs)

@@ -15,28 +15,26 @@ def is_concrete(*trees: Any) -> bool:
 
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
-    if not isinstance(x, (np.ndarray, jax.Array)):
+    array: Any = x
+    if not isinstance(array, (np.ndarray, jax.Array)):
         try:
-            x = np.asarray(x)
+            array = np.asarray(array)
         except ValueError as error:
             raise ValueError(
                 f"{name} must be a rectangular array of numbers, but its rows differ in length; "
                 "make them equal."
             ) from error
-    if x.dtype.kind not in "fiub" and not jnp.issubdtype(x.dtype, jnp.floating):
-        raise TypeError(
-            f"{name} must hold real numbers, but has dtype {x.dtype}; convert it to floats."
-        )
-    if x.ndim != ndim:
+    if array.dtype.kind not in "fiub" and not jnp.issubdtype(array.dtype, jnp.floating):
+        raise TypeError(f"{name} must hold real numbers, but has dtype {array.dtype}; convert it to floats.")
+    if array.ndim != ndim:
         raise ValueError(
-            f"{name} must have {ndim} dimension{'s' * (ndim != 1)}, but has shape {x.shape}; "
-            "reshape it."
+            f"{name} must have {ndim} dimension{'s' * (ndim != 1)}, but has shape {array.shape}; reshape it."
         )
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        x = x.astype(np.float64 if isinstance(x, np.ndarray) else jnp.result_type(float))
-    if is_concrete(x) and x.size:
-        check_finite(name, x)
-    return x
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(np.float64 if isinstance(array, np.ndarray) else jnp.result_type(float))
+    if is_concrete(array) and array.size:
+        check_finite(name, array)
+    return array
 
 
 def check_finite(name: str, x: ArrayLike) -> None:
@@ -55,18 +53,18 @@ def check_finite(name: str, x: ArrayLike) -> None:
 
 def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int = 1) -> Any:
     """`x` as a floating array (points, d) of at least `least` points."""
-    x = as_floating(name, x, 2)
-    if dimension is not None and x.shape[1] != dimension:
+    array = as_floating(name, x, 2)
+    if dimension is not None and array.shape[1] != dimension:
         raise ValueError(
-            f"{name} must have {dimension} coordinates a row, but has {x.shape[1]}; "
+            f"{name} must have {dimension} coordinates a row, but has {array.shape[1]}; "
             "give one row per point."
         )
-    if x.shape[1] < 1 or x.shape[0] < least:
+    if array.shape[1] < 1 or array.shape[0] < least:
         raise ValueError(
             f"{name} must hold at least {least} point{'s' * (least != 1)}, but has shape "
-            f"{x.shape}; give more points."
+            f"{array.shape}; give more points."
         )
-    return x
+    return array
 
 
 def check_knots(name: str, knots: ArrayLike, order: int, count: int) -> None:

@@ -92,9 +92,7 @@ def _check_files(args: argparse.Namespace) -> str | None:
     io.check_output(args.output)
     for name in filter(None, (args.input, args.boundary)):
         if os.path.exists(name) and os.path.realpath(name) == os.path.realpath(args.output):
-            raise io.InputError(
-                f"the output {args.output} is the file that is read; give it another name."
-            )
+            raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
     if args.no_picture:
         return None
     drawable = importlib.util.find_spec("matplotlib") is not None
@@ -102,8 +100,7 @@ def _check_files(args: argparse.Namespace) -> str | None:
         return str(Path(args.output).with_suffix(".png")) if drawable else None
     if not drawable:
         raise io.InputError(
-            "a picture needs Matplotlib, which is not installed; "
-            "pip install 'jaxfit-surfaces[plot]'."
+            "a picture needs Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
         )
     io.check_output(args.picture, _PICTURES)
     return args.picture
@@ -152,9 +149,7 @@ def _choose_boundary(args: argparse.Namespace, data: io.PointData) -> Any:
     )
 
 
-def _fit(
-    args: argparse.Namespace, method: str, data: io.PointData, boundary: Any, progress: Any
-) -> Any:
+def _fit(args: argparse.Namespace, method: str, data: io.PointData, boundary: Any, progress: Any) -> Any:
     options: dict[str, Any] = {"order": args.order, "progress": progress}
     if args.max_steps is not None:
         options["max_steps"] = args.max_steps
@@ -163,7 +158,7 @@ def _fit(
         for name, value in (("tol_average", args.tol_average), ("tol_maximum", args.tol_maximum))
         if value is not None
     }
-    if method == "interpolate":
+    if method == "interpolate" and data.grid is not None:
         if tolerances:
             # Interpolation bounds the maximum error, and with it the average.
             options["tolerance"] = min(tolerances.values())
@@ -171,9 +166,7 @@ def _fit(
     return jaxfit.fit_points(data.cloud, boundary, net=args.net, **tolerances, **options)
 
 
-def _reached(
-    args: argparse.Namespace, method: str, fit: Any, average: float, maximum: float
-) -> bool:
+def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, maximum: float) -> bool:
     if method == "interpolate" and args.tol_average is None and args.tol_maximum is None:
         return bool(fit.converged)
     # Without a requested tolerance every finite fit will do.

@@ -51,9 +51,7 @@ def argument_parser() -> argparse.ArgumentParser:
     fit.add_argument("input", metavar="INPUT", help="the points, see above")
     fit.add_argument("-o", "--output", metavar="OUTPUT", required=True, help="the surface")
     fit.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
-    fit.add_argument(
-        "--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)"
-    )
+    fit.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
     fit.add_argument(
         "--method",
         choices=("auto", "interpolate", "approximate"),
@@ -61,9 +59,7 @@ def argument_parser() -> argparse.ArgumentParser:
         help="auto interpolates grids of up to 40,000 points unless --net is given, and "
         "approximates everything else",
     )
-    fit.add_argument(
-        "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
-    )
+    fit.add_argument("--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row")
     fit.add_argument("--boundary", metavar="FILE", help=".npz with the four border polylines")
     for which in ("average", "maximum"):
         fit.add_argument(
@@ -74,9 +70,7 @@ def argument_parser() -> argparse.ArgumentParser:
         )
     fit.add_argument("--max-steps", type=_count, metavar="N", help="stop after this many steps")
     picture = fit.add_mutually_exclusive_group()
-    picture.add_argument(
-        "--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)"
-    )
+    picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
     picture.add_argument("--no-picture", action="store_true", help="draw nothing")
     fit.add_argument("--float32", action="store_true", help="single precision")
     fit.add_argument("--quiet", action="store_true", help="print nothing but errors")

@@ -27,6 +27,8 @@ def pytest_addoption(parser):
 def pytest_configure(config):
     jax.config.update("jax_enable_x64", not config.getoption("--float32"))
     jax.config.update("jax_numpy_rank_promotion", "raise")
+    # Most of the session is compiling tiny problems; unoptimised code is as correct and compiles faster.
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 def pytest_collection_modifyitems(config, items):

@@ -17,9 +17,7 @@ def knots(uneven=True):
     rng = np.random.default_rng(3)
     if not uneven:
         return tuple(helpers.clamped_uniform(n, k) for n, k in zip((NU, NV), ORDER, strict=True))
-    return tuple(
-        helpers.random_clamped_knots(rng, n, k) for n, k in zip((NU, NV), ORDER, strict=True)
-    )
+    return tuple(helpers.random_clamped_knots(rng, n, k) for n, k in zip((NU, NV), ORDER, strict=True))
 
 
 def sides(net, knots_u, knots_v):

@@ -135,10 +135,7 @@ def test_a_tube_closes():
 def test_the_cloud_only_sets_the_scale_of_the_tolerance():
     boundary = wavy_boundary()
     far = np.array([[0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
-    assert (
-        base_surface(boundary, far, tolerance=5e-4).shape
-        < base_surface(boundary, tolerance=5e-4).shape
-    )
+    assert base_surface(boundary, far, tolerance=5e-4).shape < base_surface(boundary, tolerance=5e-4).shape
 
 
 def test_a_second_boundary_compiles_nothing():

@@ -1,6 +1,5 @@
 """Every point sits in exactly one slot of a row of its cell."""
 
-import helpers
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -121,9 +121,7 @@ def test_options_arrive_as_fractions(fits, folder):
 
 def test_the_surface_is_written(fits, folder):
     assert run("cloud.npz") == 0
-    np.testing.assert_array_equal(
-        read_surface("s.npz").control_points, wavy_surface().control_points
-    )
+    np.testing.assert_array_equal(read_surface("s.npz").control_points, wavy_surface().control_points)
 
 
 # --------------------------------------------------------------- exit codes

@@ -33,9 +33,7 @@ def assert_nearest(spline, points, tolerance=1e-9, **options):
     assert np.max(np.asarray(feet.distance) - expected) <= tolerance * size
     at = spline(feet.u) if feet.v is None else spline(feet.u, feet.v)
     np.testing.assert_allclose(feet.point, at, rtol=0, atol=1e-12 * size)
-    np.testing.assert_allclose(
-        feet.distance, np.linalg.norm(points - at, axis=1), rtol=0, atol=1e-12 * size
-    )
+    np.testing.assert_allclose(feet.distance, np.linalg.norm(points - at, axis=1), rtol=0, atol=1e-12 * size)
     return feet
 
 
@@ -119,9 +117,7 @@ def test_a_pole_has_feet_and_no_nan():
 def test_any_dimension(d):
     rng = np.random.default_rng(d)
     net = np.concatenate([helpers.wavy_net(7, 6), 0.2 * rng.normal(size=(7, 6, 2))], axis=-1)
-    surface = BSplineSurface(
-        net[..., :d], helpers.clamped_uniform(7, 4), helpers.clamped_uniform(6, 4)
-    )
+    surface = BSplineSurface(net[..., :d], helpers.clamped_uniform(7, 4), helpers.clamped_uniform(6, 4))
     points = rng.uniform(-0.2, 1.2, (COUNT, d))
     assert_nearest(surface, points)
 

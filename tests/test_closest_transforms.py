@@ -32,9 +32,7 @@ def test_jit_equals_eager(problem):
     for begin in (None, start):
         inside, outside = jitted(surface, points, begin), closest_point(surface, points, begin)
         for name in ("u", "v", "point", "distance"):
-            np.testing.assert_allclose(
-                getattr(inside, name), getattr(outside, name), rtol=0, atol=1e-11
-            )
+            np.testing.assert_allclose(getattr(inside, name), getattr(outside, name), rtol=0, atol=1e-11)
         np.testing.assert_array_equal(inside.status, outside.status)
         assert inside.converged.all()
 
@@ -124,9 +122,7 @@ def test_second_derivatives_equal_differences_of_first_ones(problem):
 
 
 def test_feet_on_curves_differentiate_too():
-    curve = BSplineCurve(
-        np.random.default_rng(0).normal(size=(7, 2)), helpers.clamped_uniform(7, 4)
-    )
+    curve = BSplineCurve(np.random.default_rng(0).normal(size=(7, 2)), helpers.clamped_uniform(7, 4))
     at = np.linspace(0.1, 0.9, COUNT)
     tangent = np.asarray(curve.derivative(at))
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], -1)
@@ -135,7 +131,5 @@ def test_feet_on_curves_differentiate_too():
     # Moving a point along the tangent moves its foot by dx / (|C'| (1 - curvature * height)).
     slope = jax.jit(jax.jacfwd(lambda x: closest_point(curve, x, start=jnp.asarray(at)).u))(points)
     second = np.asarray(curve.derivative(at, 2))
-    expected = tangent / (
-        np.sum(tangent**2, 1) - np.sum(0.02 * normal * second, 1)
-    )[:, None]
+    expected = tangent / (np.sum(tangent**2, 1) - np.sum(0.02 * normal * second, 1))[:, None]
     np.testing.assert_allclose(slope[np.arange(COUNT), np.arange(COUNT)], expected, rtol=1e-8)

@@ -168,7 +168,7 @@ def test_the_whole_way_from_a_cloud_with_its_boundary():
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"points": np.where(POINTS == POINTS[7], np.nan, POINTS)}, "points must be finite"),
+        ({"points": np.where(POINTS[7] == POINTS, np.nan, POINTS)}, "points must be finite"),
         ({"points": POINTS[:, :2]}, "points must have 3 coordinates"),
         ({"points": POINTS[:3]}, "points must hold at least 4 points"),
         ({"points": np.ones((9, 3))}, "must not all coincide"),

@@ -130,7 +130,7 @@ def test_throw_raises_the_reason():
 @pytest.mark.parametrize(
     ("grid", "sentence"),
     [
-        (np.where(GRID == GRID[3, 3], np.nan, GRID), "grid must be finite"),
+        (np.where(GRID[3, 3] == GRID, np.nan, GRID), "grid must be finite"),
         (GRID[:3], "grid must have at least 4 x 4 points"),
         (GRID[..., 0], "grid must have 3 dimensions"),
         (np.ones((5, 5, 3)), "must not all coincide"),

@@ -96,9 +96,7 @@ def test_a_failure_half_way_leaves_the_old_file(tmp_path, monkeypatch, breaks):
 
 def test_surfaces_that_are_not_finite_are_not_written(tmp_path):
     surface = wavy_surface()
-    broken = type(surface)(
-        surface.control_points.at[0, 0, 0].set(0.0), surface.knots_u, surface.knots_v
-    )
+    broken = type(surface)(surface.control_points.at[0, 0, 0].set(0.0), surface.knots_u, surface.knots_v)
     object.__setattr__(broken, "control_points", surface.control_points * np.nan)
     with pytest.raises(ValueError, match="finite control points"):
         write_surface(tmp_path / "s.npz", broken)

@@ -212,9 +212,7 @@ def test_basis_functions_are_a_partition_of_unity(seed):
     slopes = np.asarray(basis_derivatives(knots, order, u, 2))
     assert slopes.shape == (3, 20, order)
     for table in slopes[1:]:
-        np.testing.assert_allclose(
-            table.sum(axis=1), 0.0, atol=100 * helpers.eps() * np.abs(table).max()
-        )
+        np.testing.assert_allclose(table.sum(axis=1), 0.0, atol=100 * helpers.eps() * np.abs(table).max())
 
 
 @pytest.mark.float32_too

@@ -45,9 +45,7 @@ def test_gradients_equal_finite_differences():
     slopes, slope_u, slope_v = gradient(surface, u, v)
     assert_slope(lambda u: energy(surface, u, v), u, slope_u)
     assert_slope(lambda v: energy(surface, u, v), v, slope_v)
-    assert_slope(
-        lambda net: energy(BSplineSurface(net, knots_u, knots_v), u, v), net, slopes.control_points
-    )
+    assert_slope(lambda net: energy(BSplineSurface(net, knots_u, knots_v), u, v), net, slopes.control_points)
 
     def with_inner_knots(inner):
         knots = np.concatenate([knots_u[:4], inner, knots_u[-4:]])
@@ -68,9 +66,7 @@ def test_gradients_are_finite_on_knots_on_ends_and_outside(repeats):
 
 def test_the_gradient_by_the_parameter_is_the_derivative():
     # On the ends as well, where a plain clip would halve it; outside the point does not move.
-    curve = BSplineCurve(
-        np.random.default_rng(0).normal(size=(7, 2)), helpers.clamped_uniform(7, 4)
-    )
+    curve = BSplineCurve(np.random.default_rng(0).normal(size=(7, 2)), helpers.clamped_uniform(7, 4))
     u = np.array([0.0, 0.25, 0.6, 1.0])
     tangents = jax.jit(jax.vmap(jax.jacfwd(curve)))(u)
     np.testing.assert_allclose(tangents, curve.derivative(u), atol=1e-12)

@@ -41,9 +41,7 @@ def test_insertion_equals_scipy_one_knot_at_a_time(order):
         spline = insert(x, spline)
     finer = curve.insert_knots(new)
     np.testing.assert_allclose(finer.knots, spline.t)
-    np.testing.assert_allclose(
-        finer.control_points, spline.c[: finer.control_points.shape[0]], atol=1e-12
-    )
+    np.testing.assert_allclose(finer.control_points, spline.c[: finer.control_points.shape[0]], atol=1e-12)
 
 
 @pytest.mark.float32_too
@@ -99,14 +97,9 @@ def test_split_gives_the_bezier_points_of_every_span(order):
     assert patches.shape == (breaks_u.size - 1, breaks_v.size - 1, *order, 3)
     x = np.array([0.0, 0.3, 0.9])
     # Bernstein polynomials by their definition.
-    basis = [
-        np.stack([comb(k - 1, a) * x**a * (1 - x) ** (k - 1 - a) for a in range(k)]) for k in order
-    ]
+    basis = [np.stack([comb(k - 1, a) * x**a * (1 - x) ** (k - 1 - a) for a in range(k)]) for k in order]
     on_patches = np.einsum("stabd,ax,by->sxtyd", patches, *basis)
-    us, vs = (
-        (b[:-1, None] + np.diff(b)[:, None] * x).ravel()
-        for b in map(np.asarray, surface.split()[1:])
-    )
+    us, vs = ((b[:-1, None] + np.diff(b)[:, None] * x).ravel() for b in map(np.asarray, surface.split()[1:]))
     expected = np.asarray(surface.grid(us, vs)).reshape(on_patches.shape)
     scale = np.abs(surface.control_points).max()
     assert np.abs(on_patches - expected).max() <= 100 * helpers.eps() * scale

@@ -71,8 +71,7 @@ class Boundary(eqx.Module):
         data = as_floating("grid", grid, 3)
         if data.shape[0] < 2 or data.shape[1] < 2:
             raise ValueError(
-                f"grid must hold at least 2 x 2 points, but has shape {data.shape}; give an "
-                "array (n, m, d)."
+                f"grid must hold at least 2 x 2 points, but has shape {data.shape}; give an array (n, m, d)."
             )
         return cls(v0=data[:, 0], v1=data[:, -1], u0=data[0], u1=data[-1])
 
@@ -121,10 +120,7 @@ def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
 
 
 def _gaps(lines: dict[str, np.ndarray]) -> list[float]:
-    ends = [
-        lines[v][v_end].astype(float) - lines[u][u_end].astype(float)
-        for v, v_end, u, u_end in _CORNERS
-    ]
+    ends = [lines[v][v_end].astype(float) - lines[u][u_end].astype(float) for v, v_end, u, u_end in _CORNERS]
     return [float(np.linalg.norm(x)) for x in ends]
 
 

@@ -68,9 +68,7 @@ def simplify(
     return np.sort(kept)
 
 
-def _split(
-    points: np.ndarray, arc: np.ndarray, i: int, j: int, tolerance: float
-) -> tuple[int, float]:
+def _split(points: np.ndarray, arc: np.ndarray, i: int, j: int, tolerance: float) -> tuple[int, float]:
     """Where to split the piece i..j, and its farthest distance, 0 if within the tolerance."""
     start, chord = points[i], points[j] - points[i]
     inner = points[i + 1 : j] - start

@@ -1,5 +1,9 @@
 """Points in rows of one cell, and polynomials evaluated along them: what every fit's speed rests on."""
 
+from jaxfit._cells._layout import local_coordinates as local_coordinates
+from jaxfit._cells._layout import row_coefficients as row_coefficients
+from jaxfit._cells._layout import rows_of as rows_of
+from jaxfit._cells._layout import values_at as values_at
 from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
@@ -8,7 +12,3 @@ from jaxfit._cells._rows import make_rows as make_rows
 from jaxfit._cells._rows import row_width as row_width
 from jaxfit._cells._stage import staged as staged
 from jaxfit._cells._sums import net_sums as net_sums
-from jaxfit._cells._layout import local_coordinates as local_coordinates
-from jaxfit._cells._layout import row_coefficients as row_coefficients
-from jaxfit._cells._layout import rows_of as rows_of
-from jaxfit._cells._layout import values_at as values_at

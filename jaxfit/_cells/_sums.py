@@ -36,9 +36,7 @@ def net_sums(
     return _cells_to_net(cells, poly_u, poly_v)
 
 
-def _row_moments(
-    s: Array, t: Array, values: Array, order_u: int, order_v: int
-) -> Float[Array, "rows K L c"]:
+def _row_moments(s: Array, t: Array, values: Array, order_u: int, order_v: int) -> Float[Array, "rows K L c"]:
     # One broadcast product, summed along the row: a batched matrix product of these sizes is several times
     # slower on a CPU, and a sum for each pair of powers takes long to compile.
     powers_s, powers_t = _powers(s, order_u), _powers(t, order_v)

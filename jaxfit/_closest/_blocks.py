@@ -202,9 +202,7 @@ def _box(pieces: Pieces, feet: Feet, home: Home, border: tuple[Array, ...]) -> t
     return cell_u * axis_v.cells + cell_v, box
 
 
-def _cross_creases(
-    pieces: Pieces, old: Feet, new: Feet, home: Home, noise: Array
-) -> tuple[Feet, Home]:
+def _cross_creases(pieces: Pieces, old: Feet, new: Feet, home: Home, noise: Array) -> tuple[Feet, Home]:
     """Send feet that have just arrived on a crease to look across it; the rest stay as they are."""
     arrived = new.converged & ~old.done
     gained = new.best < home.before - noise * (2.0 * jnp.sqrt(new.best) + noise)

@@ -116,16 +116,16 @@ def closest_point(
     """
     method = Newton() if method is None else method
     net, knots_u, knots_v = as_surface_arrays(surface)
-    points = as_points("points", points, net.shape[-1])
-    starts = _checked_start(start, points.shape[0], isinstance(surface, BSplineCurve))
+    queries = as_points("points", points, net.shape[-1])
+    starts = _checked_start(start, queries.shape[0], isinstance(surface, BSplineCurve))
     if tolerance is None:
         tolerance = default_foot_tolerance(net.dtype)
     elif is_concrete(tolerance):
         advise_x64(float(tolerance), net.dtype)
-    if is_concrete(net, knots_u, knots_v, points, starts, tolerance, max_steps):
-        result = _on_host(method, (net, knots_u, knots_v), points, starts, tolerance, max_steps)
+    if is_concrete(net, knots_u, knots_v, queries, starts, tolerance, max_steps):
+        result = _on_host(method, (net, knots_u, knots_v), queries, starts, tolerance, max_steps)
     else:
-        result = _traced(method, (net, knots_u, knots_v), points, starts, tolerance, max_steps)
+        result = _traced(method, (net, knots_u, knots_v), queries, starts, tolerance, max_steps)
     if isinstance(surface, BSplineCurve):
         result = eqx.tree_at(lambda x: x.v, result, None)
     return result
@@ -194,15 +194,15 @@ def _describe(
     pieces: Pieces, u: Array, v: Array, converged: Array
 ) -> tuple[Float[Array, "d points"], Int[Array, " points"]]:
     """Foot points (centred) and their status."""
-    status = _status(pieces.axis_u.breaks, pieces.axis_v.breaks, u, v, converged)
+    curve = pieces.coefficients.shape[-1] == 1
+    status = _status(pieces.axis_u.breaks, pieces.axis_v.breaks, u, v, converged, curve)
     return values_at(pieces, u, v), status
 
 
-def _status(breaks_u: Array, breaks_v: Array, u: Array, v: Array, converged: Array) -> Array:
+def _status(breaks_u: Array, breaks_v: Array, u: Array, v: Array, converged: Array, curve: bool) -> Array:
     at_u = ((u <= breaks_u[0]) | (u >= breaks_u[-1])).astype(jnp.int32)
     at_v = ((v <= breaks_v[0]) | (v >= breaks_v[-1])).astype(jnp.int32)
-    at_v = at_v if breaks_v.shape[0] > 2 else at_v * (breaks_v[-1] > breaks_v[0])
-    return jnp.where(converged, at_u + at_v, int(PointStatus.NOT_CONVERGED))
+    return jnp.where(converged, at_u if curve else at_u + at_v, int(PointStatus.NOT_CONVERGED))
 
 
 def _on_host(
@@ -225,7 +225,7 @@ def _on_host(
         jnp.asarray(max_steps, jnp.int32),
     )
 
-    def feet_from(which: Any, u: ArrayLike, v: ArrayLike) -> dict[str, np.ndarray]:
+    def feet_from(which: Any, u: Any, v: Any) -> dict[str, np.ndarray]:
         """Feet of the points `which`, from (u, v); always the same shapes."""
         target = jnp.asarray(_padded(centred[which], size).T.astype(dtype))
         starts = (jnp.asarray(_padded(np.asarray(x), size).astype(dtype)) for x in (u, v))
@@ -237,7 +237,7 @@ def _on_host(
     if start is not None:
         best = feet_from(slice(None), *start)
     else:
-        best = _globally(feet_from, Search(prepared.samples, centred), size)
+        best = globally(feet_from, prepared.samples, centred, size)
     padded = (jnp.asarray(_padded(best[name], size)) for name in ("u", "v", "ok"))
     point, status = _describe(prepared.pieces, *padded)
     shifted = np.asarray(point).T[:count] + np.asarray(prepared.centre)
@@ -245,11 +245,16 @@ def _on_host(
         distance = np.sqrt(best["f"])
     fields = (best["u"], best["v"], shifted, distance)
     flags = (best["ok"], np.asarray(status)[:count], best["n"])
-    return ClosestPoint(*(jnp.asarray(x) for x in (*fields, *flags)))
+    # Not jnp.asarray, which compiles a copy for every new size.
+    return ClosestPoint(*(jax.device_put(x) for x in (*fields, *flags)))
 
 
-def _globally(feet_from: Any, search: Search, size: int) -> dict[str, np.ndarray]:
-    """The nearest foot of all: from the nearest sample, then from every rival that is left."""
+def globally(feet_from: Any, samples: Samples, points: np.ndarray, size: int) -> dict[str, np.ndarray]:
+    """The nearest foot of all: from the nearest sample, then from every rival that is left.
+
+    `feet_from(which, u, v)` gives the feet of some points from starts, at most `size` at a time.
+    """
+    search = Search(samples, points)
     best = feet_from(slice(None), *search.nearest())
     distance = np.sqrt(best["f"].astype(np.float64))
     rivals = search.rivals(best["u"], best["v"], distance)
@@ -267,9 +272,7 @@ def _globally(feet_from: Any, search: Search, size: int) -> dict[str, np.ndarray
     return best
 
 
-def _take_nearer(
-    best: dict[str, np.ndarray], which: np.ndarray, other: dict[str, np.ndarray]
-) -> None:
+def _take_nearer(best: dict[str, np.ndarray], which: np.ndarray, other: dict[str, np.ndarray]) -> None:
     """Replace feet by nearer ones; `which` may name a point several times."""
     np.add.at(best["n"], which, other["n"])
     # Of each point's, the converged ones first and of these the nearest.
@@ -316,5 +319,5 @@ def _traced(
     order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
     ends_u = knots_u[order_u - 1 : knots_u.shape[0] - order_u + 1]
     ends_v = knots_v[order_v - 1 : knots_v.shape[0] - order_v + 1]
-    status = _status(ends_u, ends_v, u, v, converged)
+    status = _status(ends_u, ends_v, u, v, converged, order_v == 1)
     return ClosestPoint(u, v, point, distance, converged, status, steps)

@@ -174,9 +174,7 @@ def next_trial(method: AbstractFootMethod, careful: bool) -> Callable[..., tuple
     step's length and sees to it that it leads downhill.
     """
 
-    def after(
-        first: Forms, u: Array, v: Array, box: Box, tolerance: Array
-    ) -> tuple[Array, Array]:
+    def after(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array]:
         pinned_s, pinned_t, settled = _pins(first, u, v, box, tolerance)
         ds, dt = method.step(first, pinned_s, pinned_t)
         if careful:
@@ -220,9 +218,7 @@ def _within(box: Box, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, 
     return jnp.clip(ds, low_s, high_s), jnp.clip(dt, low_t, high_t)
 
 
-def _pins(
-    first: Forms, u: Array, v: Array, box: Box, tolerance: Array
-) -> tuple[Array, Array, Array]:
+def _pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array, Array]:
     """Which coordinates are held at a bound by the gradient, and whether the free ones are settled.
 
     Settled: the residual's components along the free tangents, lengths, are below the tolerance.
@@ -237,6 +233,4 @@ def _pins(
 
 def keep(which: Array, old: Feet, new: Feet) -> Feet:
     """`old` where `which`, `new` elsewhere."""
-    return Feet(
-        jnp.where(which[None], old.real, new.real), jnp.where(which[None], old.whole, new.whole)
-    )
+    return Feet(jnp.where(which[None], old.real, new.real), jnp.where(which[None], old.whole, new.whole))

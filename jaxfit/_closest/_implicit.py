@@ -54,7 +54,7 @@ def foot_parameters(
 
 @foot_parameters.defjvp
 def _foot_parameters_jvp(method: AbstractFootMethod, primals: Any, tangents: Any) -> Any:
-    net, knots_u, knots_v, points, start, tolerance, max_steps = primals
+    net, knots_u, knots_v, points, _, tolerance, _ = primals
     u, v, converged, steps = foot_parameters(method, *primals)
 
     def slopes(net: Array, knots_u: Array, knots_v: Array, points: Array) -> tuple[Array, Array]:

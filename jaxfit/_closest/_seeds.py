@@ -9,17 +9,18 @@ not beside a foot already found is a start.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfit._cells import Jet, evaluate_jet
 from jaxfit._splines._pieces import Axis, Pieces
 
 LEAST_SAMPLES = 24  # per direction, for surfaces of few cells
+CURVE_SAMPLES = 24  # per span of a curve
 MOST_SAMPLES = 400_000  # in all, for nets of very many cells
 SLACK = 2.0  # for steps along u and v that are not at right angles
 SAG = 1.5  # for second derivatives that change between samples
@@ -37,6 +38,8 @@ class Samples(NamedTuple):
     v: Float[Array, " b"]
     points: Float[Array, "a b d"]
     slack: Float[Array, "a b"]  # SLACK times the squared half spacing around each sample
+    stretch_u: Int[Array, " a"]  # which smooth stretch between creases a sample belongs to
+    stretch_v: Int[Array, " b"]
     sag: Float[Array, "a b"]  # SAG times the second-order normal part of a step, doubled
 
 
@@ -52,7 +55,7 @@ def sample(pieces: Pieces) -> Samples:
     """Sample every cell evenly, and the borders."""
     axis_u, axis_v = pieces.axis_u, pieces.axis_v
     flat = pieces.coefficients.shape[-1] == 1  # a curve: nothing happens along v
-    count_u = samples_per_cell(axis_u.cells, axis_v.cells)
+    count_u = CURVE_SAMPLES if flat else samples_per_cell(axis_u.cells, axis_v.cells)
     count_v = samples_per_cell(axis_v.cells, axis_u.cells)
     u = _along(axis_u, count_u)
     v = axis_v.breaks[:1] if flat else _along(axis_v, count_v)
@@ -66,7 +69,9 @@ def sample(pieces: Pieces) -> Samples:
     jet = evaluate_jet(coefficients, s, t)
     points = jnp.stack(jet.value, axis=-1)
     slack = 0.25 * SLACK * (_gap2(points, 0) + _gap2(points, 1))
-    return Samples(u, v, points, slack, SAG * _sag(jet, 1.0 / count_u, 1.0 / count_v))
+    stretches = axis_u.first[cell_u], axis_v.first[cell_v]
+    sag = SAG * _sag(jet, 1.0 / count_u, 1.0 / count_v)
+    return Samples(u, v, points, slack, *stretches, sag)
 
 
 def _along(axis: Axis, count: int) -> Float[Array, " a"]:
@@ -111,6 +116,10 @@ class Search:
         cloud = np.asarray(samples.points, np.float64)
         self.cloud = cloud.reshape(-1, cloud.shape[-1])
         self.slack, self.sag = (np.ravel(x) for x in (samples.slack, samples.sag))
+        self.stretch_u, self.stretch_v = (
+            np.asarray(samples.stretch_u),
+            np.asarray(samples.stretch_v),
+        )
         self.tree = KDTree(self.cloud, balanced_tree=False, compact_nodes=False)
         self.points = points
         self.distance, self.index = self._query(np.arange(len(points)), NEIGHBOURS[0])
@@ -133,7 +142,8 @@ class Search:
         which = np.arange(len(distance))
         near, index = self.distance, self.index
         who, sample = [], []
-        for more in (*NEIGHBOURS[1:], None):
+        steps: tuple[Any, ...] = (*NEIGHBOURS[1:], None)
+        for more in steps:
             reach = distance[which, None]
             open_ = near**2 <= reach**2 + self.slack[index] + reach * self.sag[index]
             # Samples farther than the last are taken to have no more than WIDER times its slack.
@@ -152,23 +162,27 @@ class Search:
         return Rivals(self, np.concatenate(who), np.concatenate(sample), u, v)
 
     def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
-        """Whether none of the eight samples around `sample` is nearer to the point `who`."""
+        """Whether none of the eight samples around `sample` is nearer to the point `who`.
+
+        Only samples of the same smooth stretch count: a valley may end at a crease.
+        """
         a, b = self.u.size, self.v.size
         row, column = sample // b, sample % b
         here = np.sum((self.cloud[sample] - self.points[who]) ** 2, axis=1)
         low = np.ones(len(who), bool)
         for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
-            beside = np.clip(row + i, 0, a - 1) * b + np.clip(column + j, 0, b - 1)
-            low &= here <= np.sum((self.cloud[beside] - self.points[who]) ** 2, axis=1)
+            next_row, next_column = np.clip(row + i, 0, a - 1), np.clip(column + j, 0, b - 1)
+            beside = self.cloud[next_row * b + next_column]
+            apart = self.stretch_u[next_row] != self.stretch_u[row]
+            apart |= self.stretch_v[next_column] != self.stretch_v[column]
+            low &= apart | (here <= np.sum((beside - self.points[who]) ** 2, axis=1))
         return low
 
 
 class Rivals:
     """Pairs (point, sample) still to be tried, grouped by point, the most promising first."""
 
-    def __init__(
-        self, search: Search, who: np.ndarray, sample: np.ndarray, u: np.ndarray, v: np.ndarray
-    ):
+    def __init__(self, search: Search, who: np.ndarray, sample: np.ndarray, u: np.ndarray, v: np.ndarray):
         self.search, self.who, self.sample = search, who, sample
         self.found(u, v)
         # Valleys of the samples first, and of the rest, which should lead to the same feet, only a few.
@@ -186,11 +200,14 @@ class Rivals:
     def found(self, u: np.ndarray, v: np.ndarray) -> None:
         """Drop the samples beside the feet at (u, v), which are given for all points."""
         search = self.search
-        row = np.interp(u[self.who], search.u, np.arange(search.u.size))
-        column = np.interp(v[self.who], search.v, np.arange(search.v.size))
-        far_u = np.abs(self.sample // search.v.size - row) > BESIDE
-        far_v = np.abs(self.sample % search.v.size - column) > BESIDE
-        self._keep(far_u | far_v)
+        far = np.zeros(len(self.who), bool)
+        numbers = np.divmod(self.sample, search.v.size)
+        axes = ((search.u, search.stretch_u, u), (search.v, search.stretch_v, v))
+        for number, (parameters, stretch, foot) in zip(numbers, axes, strict=True):
+            at = np.interp(foot[self.who], parameters, np.arange(parameters.size))
+            # Across a crease there may be another foot, however close.
+            far |= (np.abs(number - at) > BESIDE) | (stretch[number] != stretch[at.astype(int)])
+        self._keep(far)
 
     def first(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One start for each point that has any, taken off the list."""
@@ -220,7 +237,7 @@ def best_samples(
     padded = jnp.pad(target, ((0, 0), (0, -points % size)), mode="edge")
 
     def block(goal: Float[Array, "d size"]) -> tuple[Array, Array]:
-        square = sum((cloud[:, k, None] - goal[k][None, :]) ** 2 for k in range(cloud.shape[1]))
+        square: Any = sum((cloud[:, k, None] - goal[k][None, :]) ** 2 for k in range(cloud.shape[1]))
         first = jnp.argmin(square, axis=0)
         beside = (jnp.abs(row[:, None] - row[first][None, :]) <= 2) & (
             jnp.abs(column[:, None] - column[first][None, :]) <= 2

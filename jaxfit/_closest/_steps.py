@@ -16,7 +16,6 @@ from jax import Array
 
 from jaxfit._cells import Jet
 
-
 # What a lifted eigenvalue of the Hessian, against the first form, is at least.
 LEAST_EIGENVALUE = 1e-3
 # Hu and Wallner's circle is followed up to this share of the way to the centre of curvature.
@@ -118,6 +117,7 @@ class HuWallner(AbstractFootMethod):
         ss, st, tt = ds * ds, 2.0 * ds * dt, dt * dt  # second derivative along (ds, dt)
         length2 = ss * first.E + st * first.F + tt * first.G
         height2 = first.f - 2.0 * (ds * first.gradient_s + dt * first.gradient_t) + length2
+        assert first.drift is not None
         ss_s, ss_t, st_s, st_t, tt_s, tt_t = first.drift
         along = ds * (ss * ss_s + st * st_s + tt * tt_s) + dt * (ss * ss_t + st * st_t + tt * tt_t)
         above = ss * first.e_ss + st * first.e_st + tt * first.e_tt - along

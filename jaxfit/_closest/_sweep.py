@@ -137,9 +137,7 @@ def cell_box(pieces: Pieces, cell: Array) -> Box:
     return Box(low_u, high_u, low_v, high_v, centre_u, half_u, centre_v, half_v)
 
 
-def _lay_out(
-    pieces: Pieces, rows: Rows, target: Array, feet: Plain
-) -> tuple[Box, Array, list[Array], Plain]:
+def _lay_out(pieces: Pieces, rows: Rows, target: Array, feet: Plain) -> tuple[Box, Array, list[Array], Plain]:
     """Everything that a sweep reads, in rows; empty slots are left out."""
     last = target.shape[1] - 1
     there = jax.tree.map(lambda x: x[jnp.minimum(rows.point, last)], feet)

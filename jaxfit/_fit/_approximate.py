@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -12,6 +13,7 @@ from jaxfit._checks import as_floating, as_points, is_concrete
 from jaxfit._closest import closest_point
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_approximation import GeometricApproximation, border
+from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, make_problem, padded_start, unit_of
 from jaxfit._precision import advise_x64
@@ -77,28 +79,31 @@ def approximate(
     second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
-    points = as_points("points", points, base.dimension, least=LEAST_POINTS)
-    weights = _checked_weights(weights, points.shape[0])
+    cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
+    pulls = _checked_weights(weights, cloud.shape[0])
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
             advise_x64(float(tolerance), np.dtype(base.control_points.dtype))
-    unit = unit_of(points)
-    if start is None:
-        feet = closest_point(base, points)
-        start = (feet.u, feet.v)
-    else:
-        start = _checked_start(start, points.shape[0])
-    problem = make_problem(points, weights, base, unit, method.foot_tolerance)
+    unit = unit_of(cloud)
+    concrete = is_concrete(cloud, base, pulls, start)
+    problem = make_problem(cloud, pulls, base, unit, method.foot_tolerance)
     dtype, size = problem.target.dtype, problem.target.shape[1]
     net = jnp.asarray(unit.inward(base.control_points), dtype)
-    u, v = (padded_start(x, size, dtype) for x in start)
-    bounds = (jnp.inf if x is None else x for x in (tol_average, tol_maximum))
-    limits = Limits(*(jnp.asarray(x, dtype) for x in bounds), jnp.asarray(max_steps, jnp.int32))
-    concrete = is_concrete(points, base, start)
+    if start is not None:
+        u, v = _checked_start(start, cloud.shape[0])
+    elif concrete:
+        u, v, _, _ = global_feet(method, problem, net, cloud.shape[0], max_steps)
+    else:
+        feet = closest_point(base, cloud)
+        u, v = feet.u, feet.v
+    u, v = (padded_start(x, size, dtype) for x in (u, v))
+    average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
+    limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     carry = begin(net, u, v, max_steps)
     carry = run(method, problem, limits, carry, progress if concrete else None)
     surface = _surface(carry, base, unit, method)
-    return _finished(carry, problem, points, unit, surface, concrete, throw)
+    parts = _parts(carry, method, problem, cloud.shape[0], max_steps, concrete)
+    return _finished(carry, parts, unit, surface, concrete, throw)
 
 
 def _surface(
@@ -112,21 +117,37 @@ def _surface(
     return BSplineSurface(net, base.knots_u, base.knots_v)
 
 
-def _finished(
+def _parts(
     carry: Carry,
+    method: GeometricApproximation,
     problem: Problem,
-    points: Any,
-    unit: Unit,
-    surface: BSplineSurface,
+    count: int,
+    max_steps: int,
     concrete: bool,
-    throw: bool,
-) -> Fit:
+) -> Any:
+    """Feet, errors and whether feet were found.
+
+    Feet were followed locally; where another part of the surface has come nearer, that counts.
+    """
     measured = carry.measured
-    parts = (measured.u, measured.v, measured.error / problem.diagonal, measured.found)
-    if concrete:
-        parts = _nearest_of_all(parts, points, unit, surface)
-    u, v, errors, found = (jnp.asarray(x) for x in parts)
-    xp = np if concrete else jnp  # NumPy compiles nothing for a new size
+    errors = measured.error / problem.diagonal
+    if not concrete:
+        return measured.u, measured.v, errors, measured.found
+    parts = (measured.u, measured.v, errors, measured.found)
+    u, v, distances, found = (np.array(x)[:count] for x in parts)
+    best = global_feet(method, problem, carry.net, count, max_steps)
+    distance = best[2] / float(problem.diagonal)
+    nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
+    for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
+        old[nearer] = new[nearer]
+    return u, v, distances, found
+
+
+def _finished(
+    carry: Carry, parts: Any, unit: Unit, surface: BSplineSurface, concrete: bool, throw: bool
+) -> Fit:
+    xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
+    u, v, errors = (jax.device_put(x) if concrete else x for x in parts[:3])
     return Fit(
         surface=surface,
         u=u,
@@ -144,32 +165,20 @@ def _finished(
     )
 
 
-def _nearest_of_all(parts: Any, points: Any, unit: Unit, surface: BSplineSurface) -> Any:
-    """Feet were followed locally; where another part of the surface has come nearer, take that."""
-    count = points.shape[0]
-    u, v, errors, found = (np.array(x)[:count] for x in parts)
-    best = closest_point(surface, points)
-    distance = np.asarray(best.distance) / unit.diagonal
-    nearer = np.asarray(best.converged) & ((distance < errors * (1 - 1e-6)) | ~found)
-    for old, new in ((u, best.u), (v, best.v), (errors, distance), (found, best.converged)):
-        old[nearer] = np.asarray(new)[nearer]
-    return u, v, errors, found
-
-
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
     if weights is None:
         return None
-    weights = as_floating("weights", weights, 1)
-    if weights.shape[0] != count:
+    pulls = as_floating("weights", weights, 1)
+    if pulls.shape[0] != count:
         raise ValueError(
             f"weights must hold one number for each of the {count} points, but has shape "
-            f"{weights.shape}; give both the same length."
+            f"{pulls.shape}; give both the same length."
         )
-    if is_concrete(weights) and (np.asarray(weights).min() < 0 or not np.asarray(weights).any()):
+    if is_concrete(pulls) and (np.asarray(pulls).min() < 0 or not np.asarray(pulls).any()):
         raise ValueError(
             "weights must not be negative and not all zero; give each point a weight of 0 or more."
         )
-    return weights
+    return pulls
 
 
 def _checked_start(start: Any, count: int) -> tuple[Any, Any]:
@@ -221,10 +230,10 @@ def fit_points(
             "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
             "four polylines around the patch."
         )
-    points = as_points("points", points, least=LEAST_POINTS)
-    net = _default_net(points.shape[0], boundary, order) if net is None else net
-    base = base_surface(boundary, points, net=net, order=order)
-    return approximate(points, base, method, **options)
+    cloud = as_points("points", points, least=LEAST_POINTS)
+    net = _default_net(cloud.shape[0], boundary, order) if net is None else net
+    base = base_surface(boundary, cloud, net=net, order=order)
+    return approximate(cloud, base, method, **options)
 
 
 def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:
@@ -233,7 +242,5 @@ def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tupl
     ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
     root = np.sqrt(max(count / POINTS_PER_CONTROL_POINT, 1.0))
     wanted = (round(root * ratio), round(root / ratio))
-    nu, nv = (
-        int(np.clip(n, 2 * k, MOST_CONTROL_POINTS)) for n, k in zip(wanted, order, strict=True)
-    )
+    nu, nv = (int(np.clip(n, 2 * k, MOST_CONTROL_POINTS)) for n, k in zip(wanted, order, strict=True))
     return nu, nv

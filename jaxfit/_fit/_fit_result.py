@@ -4,7 +4,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -65,7 +64,13 @@ class Fit(eqx.Module):
     @property
     def message(self) -> str:
         """Why the fit stopped, in a sentence."""
-        return RESULTS[self.result]
+        return sentence_of(self.result)
+
+
+def sentence_of(result: Any) -> str:
+    """The sentence that an item of RESULTS stands for."""
+    sentences: Any = RESULTS
+    return sentences[result]
 
 
 def history_of(carry: Carry) -> History:
@@ -73,7 +78,7 @@ def history_of(carry: Carry) -> History:
     if is_concrete(carry):
         end = int(carry.step) + 1
         # Cut by NumPy: by JAX, every new length would be a new compilation.
-        cut = (jnp.asarray(np.asarray(x)[:end]) for x in (carry.average, carry.maximum))
+        cut = (jax.device_put(np.asarray(x)[:end]) for x in (carry.average, carry.maximum))
         return History(*cut)
     return History(carry.average, carry.maximum)
 
@@ -83,7 +88,7 @@ def outcome(carry: Carry, throw: bool) -> Any:
     result = result_of(carry.code)
     if throw and is_concrete(carry):
         if not bool(result == RESULTS.converged):
-            raise RuntimeError(f"the fit did not converge: {RESULTS[result]}")
+            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
     elif throw:
         _, result = eqx.error_if(
             (carry.net, result), result != RESULTS.converged, "the fit did not converge."

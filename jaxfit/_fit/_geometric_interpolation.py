@@ -54,7 +54,10 @@ class GeometricInterpolation(AbstractIterativeMethod):
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Closest points from the last ones."""
-        nu, nv = (knots.shape[0] - k for knots, k in zip((problem.knots_u, problem.knots_v), pieces.order, strict=True))
+        nu, nv = (
+            knots.shape[0] - k
+            for knots, k in zip((problem.knots_u, problem.knots_v), pieces.order, strict=True)
+        )
         corners = border(nu, nv, corners_only=True).reshape(-1)
         feet = project(
             self.foot_method,

@@ -63,11 +63,11 @@ def interpolate(
     Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
     differentiation. On a closed grid (first row equal to the last) the feet stay on their side of the seam.
     """
-    grid = _checked_grid(grid, order)
+    data = _checked_grid(grid, order)
     method = GeometricInterpolation() if method is None else method
-    n, m, d = grid.shape
-    unit = unit_of(grid.reshape(-1, d))
-    inner = unit.inward(grid)
+    n, m, d = data.shape
+    unit = unit_of(data.reshape(-1, d))
+    inner = unit.inward(data)
     parameters = grid_parameters(inner, method.parametrisation)
     knots = [averaging_knots(t, k) for t, k in zip(parameters[:2], order, strict=True)]
     net = jnp.asarray(inner)
@@ -77,28 +77,28 @@ def interpolate(
     elif is_concrete(tolerance):
         advise_x64(float(tolerance), np.dtype(surface.control_points.dtype))
     # The net fixes the size of the problem, so its points are not padded.
-    cloud = grid.reshape(-1, d)
+    cloud = data.reshape(-1, d)
     problem = make_problem(cloud, None, surface, unit, method.foot_tolerance, padded=False)
     dtype = problem.target.dtype
     u = jnp.repeat(parameters.u.astype(dtype), m)
     v = jnp.tile(parameters.v.astype(dtype), n)
     limits = Limits(
-        jnp.asarray(jnp.inf, dtype), jnp.asarray(tolerance, dtype), jnp.asarray(max_steps, jnp.int32)
+        jnp.asarray(jnp.inf, dtype),
+        jnp.asarray(tolerance, dtype),
+        jnp.asarray(max_steps, jnp.int32),
     )
     carry = begin(surface.control_points.astype(dtype), u, v, max_steps)
-    carry = run(method, problem, limits, carry, progress if is_concrete(grid) else None)
-    return _finished(carry, problem, unit, grid, surface, throw)
+    carry = run(method, problem, limits, carry, progress if is_concrete(data) else None)
+    return _finished(carry, problem, unit, data, surface, throw)
 
 
-def _finished(
-    carry: Any, problem: Any, unit: Any, grid: Any, surface: BSplineSurface, throw: bool
-) -> Fit:
+def _finished(carry: Any, problem: Any, unit: Any, grid: Any, surface: BSplineSurface, throw: bool) -> Fit:
     n, m, _ = grid.shape
     measured = carry.measured
     # Corners are never moved: they are the data, to the last bit.
     points = unit.outward(np.asarray(carry.net) if is_concrete(carry) else carry.net)
     points = jnp.asarray(points)
-    corners = border(*points.shape[:2], corners_only=True)[..., None]
+    corners = border(points.shape[0], points.shape[1], corners_only=True)[..., None]
     points = jnp.where(corners, jnp.asarray(grid, points.dtype), points)
     average, maximum = problem.summarise(measured.error)
     return Fit(
@@ -119,15 +119,13 @@ def _finished(
 
 
 def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
-    grid = as_floating("grid", grid, 3)
-    n, m, d = grid.shape
+    data = as_floating("grid", grid, 3)
+    n, m, d = data.shape
     if len(order) != 2 or not all(2 <= k <= 8 for k in order):
         raise ValueError(f"order must be a pair (K, L) of numbers from 2 to 8, but is {order}.")
     if n < order[0] or m < order[1] or d < 1:
         raise ValueError(
             f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
-            f"shape {grid.shape}; give more points or lower the order."
+            f"shape {data.shape}; give more points or lower the order."
         )
-    return grid
-
-
+    return data

@@ -1,7 +1,7 @@
 """The loop of every iterative fit, written once.
 
-A method gives `move` (a better surface from the present one and its feet) and `measure` (feet and errors on the
-present surface). The loop measures, records, decides, and moves; it ends on a surface that has been measured.
+A method gives `measure` (feet and errors on the present surface) and `move` (a better net from them). The
+loop measures, records, decides, and moves; it ends on a surface that has been measured.
 """
 
 from abc import abstractmethod
@@ -89,9 +89,10 @@ def code_of(result: Any) -> int:
 
 def result_of(code: Array) -> Any:
     """The item of RESULTS with this number, traced or not."""
-    result = RESULTS.running
+    result: Any = RESULTS.running
+    where: Any = RESULTS.where
     for item in (RESULTS.converged, RESULTS.max_steps_reached, RESULTS.stalled, RESULTS.diverged):
-        result = RESULTS.where(code == code_of(item), item, result)
+        result = where(code == code_of(item), item, result)
     return result
 
 

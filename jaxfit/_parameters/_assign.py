@@ -56,9 +56,7 @@ def curve_parameters(
     return _strict(_averaged(steps, usable), "points")
 
 
-def grid_parameters(
-    grid: ArrayLike, method: AbstractParametrisation = _CHORD_LENGTH
-) -> GridParameters:
+def grid_parameters(grid: ArrayLike, method: AbstractParametrisation = _CHORD_LENGTH) -> GridParameters:
     """Parameters of grid data: per row and column, and averaged over the other direction.
 
     Every row (fixed j, running i) gets parameters as in `curve_parameters`; their mean over j is
@@ -78,8 +76,7 @@ def grid_parameters(
     grid = jnp.asarray(as_floating("grid", grid, 3))
     if grid.shape[0] < 2 or grid.shape[1] < 2 or grid.shape[2] < 1:
         raise ValueError(
-            f"grid must hold at least 2 x 2 points, but has shape {grid.shape}; give an array "
-            "(n, m, d)."
+            f"grid must hold at least 2 x 2 points, but has shape {grid.shape}; give an array (n, m, d)."
         )
     u, rows_u = _direction(grid, method.exponent, "first")
     v, columns_v = _direction(jnp.swapaxes(grid, 0, 1), method.exponent, "second")

@@ -8,9 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 
-def find_span(
-    knots: Float[Array, " knots"], order: int, u: Float[Array, "*shape"]
-) -> Int[Array, "*shape"]:
+def find_span(knots: Float[Array, " knots"], order: int, u: Float[Array, "*shape"]) -> Int[Array, "*shape"]:
     r"""Index $l$ of the non-empty knot span $t_l \le u < t_{l+1}$ that holds each parameter.
 
     The right end of the domain belongs to the last non-empty span, and parameters outside the
@@ -24,9 +22,7 @@ def find_span(
     return jnp.clip(span, first, last)
 
 
-def clamp(
-    knots: Float[Array, " knots"], order: int, u: Float[Array, "*shape"]
-) -> Float[Array, "*shape"]:
+def clamp(knots: Float[Array, " knots"], order: int, u: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Parameters moved to the nearest point of the domain."""
     start, stop = knots[order - 1], knots[knots.shape[0] - order]
     # Not jnp.clip, which halves the gradient of a parameter that lies exactly on an end.
@@ -110,9 +106,7 @@ def spans_and_weights(
 
 
 @partial(jax.jit, static_argnames=("order", "derivatives", "extrapolate"))
-def _stacked(
-    knots: Array, order: int, u: Array, derivatives: tuple[int, ...], extrapolate: bool
-) -> Array:
+def _stacked(knots: Array, order: int, u: Array, derivatives: tuple[int, ...], extrapolate: bool) -> Array:
     _, weights = spans_and_weights(knots, order, u, derivatives, extrapolate)
     return jnp.stack([jnp.stack(each, axis=-1) for each in weights])
 

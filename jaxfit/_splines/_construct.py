@@ -15,9 +15,7 @@ from jaxfit._splines._basis import as_parameters
 LOWEST_ORDER, HIGHEST_ORDER = 2, 8
 
 
-def checked_net(
-    control_points: ArrayLike, knots: dict[str, ArrayLike]
-) -> tuple[Array, dict[str, Array]]:
+def checked_net(control_points: ArrayLike, knots: dict[str, ArrayLike]) -> tuple[Array, dict[str, Array]]:
     """The net and its named knot vectors (one per direction) as JAX arrays of one dtype."""
     net = as_floating("control_points", control_points, len(knots) + 1)
     if net.shape[-1] < 1:
@@ -76,9 +74,7 @@ def checked_derivative(name: str, count: Any) -> int:
     return count
 
 
-def checked_new_knots(
-    name: str, new_knots: ArrayLike | Sequence[float], knots: Array, order: int
-) -> Array:
+def checked_new_knots(name: str, new_knots: ArrayLike | Sequence[float], knots: Array, order: int) -> Array:
     """Knots to insert as a floating vector inside the domain of `knots`."""
     if isinstance(new_knots, Sequence):
         new_knots = jnp.asarray(new_knots, knots.dtype)

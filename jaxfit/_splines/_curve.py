@@ -73,9 +73,7 @@ class BSplineCurve(eqx.Module):
         """Points at parameters `u` of any shape."""
         return self.derivative(u, 0, extrapolate=extrapolate)
 
-    def derivative(
-        self, u: ArrayLike, du: int = 1, *, extrapolate: bool = False
-    ) -> Float[Array, "*shape d"]:
+    def derivative(self, u: ArrayLike, du: int = 1, *, extrapolate: bool = False) -> Float[Array, "*shape d"]:
         """The `du`-th derivative at parameters `u` (zero from the order on).
 
         Outside the domain it is the derivative at the nearest end, or that of the continued

@@ -92,9 +92,7 @@ def _combined(points: list[Array], weights: list[Array], derivative: int) -> Arr
     return total
 
 
-def _one_sum(
-    flat: Array, nv: int, corner: Array, weights_u: list, weights_v: list, wanted: tuple
-) -> Array:
+def _one_sum(flat: Array, nv: int, corner: Array, weights_u: list, weights_v: list, wanted: tuple) -> Array:
     # One gather per control point fuses into the sum: nothing of size K L d is ever stored.
     ((du, dv),) = wanted
     # A derivative does not see the origin: moving it near keeps the digits of far points.
@@ -106,9 +104,7 @@ def _one_sum(
     return _combined(rows, weights_u[0], du)[:, None, :]
 
 
-def _many_sums(
-    flat: Array, nv: int, corner: Array, weights_u: list, weights_v: list, wanted: tuple
-) -> Array:
+def _many_sums(flat: Array, nv: int, corner: Array, weights_u: list, weights_v: list, wanted: tuple) -> Array:
     # Several derivatives share one gathered block (points, K, L, d) instead.
     steps = jnp.arange(len(weights_u[0]))[:, None] * nv + jnp.arange(len(weights_v[0]))[None, :]
     block = _at(flat, corner[:, None, None] + steps[None])

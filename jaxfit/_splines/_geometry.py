@@ -47,9 +47,7 @@ class Curvature(NamedTuple):
 
 
 @jax.jit
-def unit_normal(
-    ru: Float[Array, "*shape 3"], rv: Float[Array, "*shape 3"]
-) -> Float[Array, "*shape 3"]:
+def unit_normal(ru: Float[Array, "*shape 3"], rv: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
     """Unit normal of two tangents, zero where they span no plane."""
     a, b = _unit(ru, 0.0), _unit(rv, 0.0)
     # Of unit tangents the cross product has the length of a sine; below a few rounding units

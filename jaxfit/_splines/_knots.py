@@ -110,9 +110,7 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
     return _running_mean(values, order - 1)[: values.shape[0] - order]
 
 
-def merge_knots(
-    a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0
-) -> Float[Array, " knots"]:
+def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) -> Float[Array, " knots"]:
     """Union of two knot vectors, each knot as often as in the vector that has it more often.
 
     Splines on `a` and on `b` are both splines on the result (section 2.3 of the paper; the knots
@@ -149,9 +147,7 @@ def merge_knots(
     return jnp.asarray(np.repeat(values, repeats))
 
 
-def missing_knots(
-    knots: ArrayLike, merged: ArrayLike, tolerance: float = 0.0
-) -> Float[Array, " m"]:
+def missing_knots(knots: ArrayLike, merged: ArrayLike, tolerance: float = 0.0) -> Float[Array, " m"]:
     """The knots of `merged` that `knots` lacks, repeated as often as they are missing.
 
     The argument that `insert_knots` needs to reach `merged`; knots within `tolerance` of each

@@ -9,11 +9,12 @@ monomials of low degree are well conditioned, so little is lost against the recu
 same with a single cell and order 1 in v.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
-
 
 FEW = 4096
 
@@ -158,19 +159,18 @@ def make_pieces(
     poly_u, poly_v = span_polynomials(knots_u, order_u), span_polynomials(knots_v, order_v)
     cells_u, cells_v = nu - order_u + 1, nv - order_v + 1
     # One direction at a time, as sums of shifted slices: no gather, and XLA fuses the lot.
-    rows = sum(
+    rows: Any = sum(
         poly_u[:, r, :, None, None] * control_points[r : r + cells_u, None] for r in range(order_u)
     )
-    both = sum(
-        rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :]
-        for r in range(order_v)
+    both: Any = sum(
+        rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :] for r in range(order_v)
     )
     ordered = both.transpose(0, 2, 3, 1, 4)
     coefficients = ordered.reshape(cells_u * cells_v, d, order_u, order_v)
     return Pieces(coefficients, make_axis(knots_u, order_u), make_axis(knots_v, order_v))
 
 
-def as_surface_arrays(spline: eqx.Module) -> tuple[Array, Array, Array]:
+def as_surface_arrays(spline: Any) -> tuple[Array, Array, Array]:
     """Control points and knots of a surface; of a curve, as a surface of order 1 in v on [0, 1]."""
     points = spline.control_points
     if points.ndim == 3:

@@ -94,9 +94,7 @@ class BSplineSurface(eqx.Module):
         K, L = self.order
         return (self.knots_u[K - 1], self.knots_u[-K]), (self.knots_v[L - 1], self.knots_v[-L])
 
-    def __call__(
-        self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False
-    ) -> Float[Array, "*shape d"]:
+    def __call__(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> Float[Array, "*shape d"]:
         """Points at the pairs (u, v); the two broadcast against each other."""
         return self._partials(u, v, ((0, 0),), extrapolate)[0]
 
@@ -143,9 +141,7 @@ class BSplineSurface(eqx.Module):
         net = self.control_points
         return evaluate_grid(net, self.knots_u, self.knots_v, columns, rows, wanted, extrapolate)
 
-    def normal(
-        self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False
-    ) -> Float[Array, "*shape 3"]:
+    def normal(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> Float[Array, "*shape 3"]:
         r"""Unit normal along $R_u \times R_v$.
 
         Zero where the two tangents vanish or are parallel to rounding (poles, folds): there is
@@ -159,15 +155,11 @@ class BSplineSurface(eqx.Module):
         self._must_be_spatial("normals")
         return _geometry.unit_normal(*self._partials(u, v, ((1, 0), (0, 1)), extrapolate))
 
-    def first_form(
-        self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False
-    ) -> "_geometry.FirstForm":
+    def first_form(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> "_geometry.FirstForm":
         r"""First fundamental form $E = R_u \cdot R_u$, $F = R_u \cdot R_v$, $G = R_v \cdot R_v$."""
         return _geometry.first_form(*self._partials(u, v, ((1, 0), (0, 1)), extrapolate))
 
-    def second_form(
-        self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False
-    ) -> "_geometry.SecondForm":
+    def second_form(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> "_geometry.SecondForm":
         r"""Second fundamental form: $R_{uu}$, $R_{uv}$ and $R_{vv}$ along the unit normal.
 
         Zero where `normal` is zero. Raises ValueError unless d = 3.
@@ -175,9 +167,7 @@ class BSplineSurface(eqx.Module):
         self._must_be_spatial("second fundamental forms")
         return _geometry.second_form(self.derivatives(u, v, 2, extrapolate=extrapolate))
 
-    def curvature(
-        self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False
-    ) -> "_geometry.Curvature":
+    def curvature(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> "_geometry.Curvature":
         """Gaussian, mean and principal curvatures; see `Curvature`.
 
         NaN where `normal` is zero. Raises ValueError unless d = 3.

@@ -143,9 +143,7 @@ def _coordinates(
 ) -> Float[np.ndarray, "... 3"]:
     """The first three columns as finite float64."""
     if array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{path}: {key} has dtype {array.dtype}; store the coordinates as real numbers."
-        )
+        raise InputError(f"{path}: {key} has dtype {array.dtype}; store the coordinates as real numbers.")
     if array.ndim != ndim or array.shape[-1] < 3:
         raise InputError(f"{path}: {key} has shape {array.shape}; it must be {shape}.")
     array = np.ascontiguousarray(array[..., :3], dtype=np.float64)

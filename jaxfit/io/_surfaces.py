@@ -133,9 +133,7 @@ def _geomdl(control_points: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray
 def _from_geomdl(document: dict[str, Any]) -> list[np.ndarray]:
     shape = document["shape"]
     if shape["type"] != "surface" or len(shape["data"]) != 1:
-        raise InputError(
-            f"holds {len(shape['data'])} x {shape['type']}; keep exactly one surface in it."
-        )
+        raise InputError(f"holds {len(shape['data'])} x {shape['type']}; keep exactly one surface in it.")
     surface = shape["data"][0]
     weights = np.asarray(surface["control_points"].get("weights", 1.0))
     if np.ptp(weights):

@@ -13,16 +13,12 @@ _MOST = 2000  # surface points per direction, whatever the density asks for
 _KNOT_LINES = 14  # at most, per direction
 
 _PLAIN = np.array([0.84, 0.80, 0.72])
-_HEIGHTS = np.array(
-    [[0.47, 0.57, 0.44], [0.80, 0.77, 0.60], [0.70, 0.57, 0.45], [0.96, 0.94, 0.91]]
-)
+_HEIGHTS = np.array([[0.47, 0.57, 0.44], [0.80, 0.77, 0.60], [0.70, 0.57, 0.45], [0.96, 0.94, 0.91]])
 _LINE = np.array([0.13, 0.25, 0.40])
 _LIGHT = np.array([-0.68, 0.42, 0.60])  # from the upper left, in front of the picture
 
 
-def render(
-    surface: BSplineSurface, aspect: float = 1.1
-) -> tuple[Float[np.ndarray, "height width 4"], View]:
+def render(surface: BSplineSurface, aspect: float = 1.1) -> tuple[Float[np.ndarray, "height width 4"], View]:
     """The surface in RGBA with shading and some of its knot lines, and the view it is seen in.
 
     The picture is transparent round the surface, and `aspect` times as wide as high.
