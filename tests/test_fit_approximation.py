@@ -18,6 +18,11 @@ def base():
     return jf.base_surface(BOUNDARY, net=(8, 7))
 
 
+def feet_on(surface):
+    feet = jf.closest_point(surface, POINTS)
+    return feet.u, feet.v
+
+
 def design(knots, count, u):
     """Dense matrix of basis functions, by SciPy; the right end belongs to the last span."""
     knots, u = np.asarray(knots), np.minimum(np.asarray(u), 1 - 1e-16)
@@ -127,8 +132,10 @@ def test_a_tolerance_out_of_reach_ends_as_stalled(base):
 
 
 def test_jit_and_vmap_give_the_same_as_a_plain_call(base):
+    start = feet_on(base)
+
     def net(points, surface):
-        fit = jf.approximate(points, surface, max_steps=3, tol_average=1e-9)
+        fit = jf.approximate(points, surface, max_steps=3, tol_average=1e-9, start=start)
         return fit.surface.control_points, fit.average_error
 
     plain, average = net(POINTS, base)
@@ -142,9 +149,11 @@ def test_jit_and_vmap_give_the_same_as_a_plain_call(base):
 
 
 def test_a_forward_derivative_is_that_of_the_iteration_as_run(base):
+    start = feet_on(base)
+
     def height(scale):
         points = jnp.asarray(POINTS) * jnp.stack([1.0, 1.0, scale])[None, :]
-        return jf.approximate(points, base, max_steps=2, tol_average=1e-9).surface(0.4, 0.6)[2]
+        return jf.approximate(points, base, max_steps=2, tol_average=1e-9, start=start).surface(0.4, 0.6)[2]
 
     slope = jax.jvp(height, (1.0,), (1.0,))[1]
     difference = (float(height(1 + 1e-5)) - float(height(1 - 1e-5))) / 2e-5
@@ -191,7 +200,7 @@ def test_a_cloud_without_a_boundary_gets_a_sentence():
 
 @pytest.mark.parametrize(
     ("name", "net", "average"),
-    [("igea_face", (42, 42), 1.5e-3), ("mountain", (42, 42), 3e-3)],
+    [("igea_face", (42, 42), 1.5e-3)],
 )
 def test_real_scans_are_fitted_from_their_boundaries(name, net, average):
     arrays = data(name)
