@@ -28,7 +28,7 @@ def advise_x64(tolerance: float, dtype: np.dtype) -> None:
     _said = True
     warnings.warn(
         f"the tolerance {tolerance:g} is beyond {np.dtype(dtype).name}; switch on "
-        'double precision with jax.config.update("jax_enable_x64", True).',
+        "double precision, the flag jax_enable_x64 of jax.config.",
         stacklevel=3,
     )
 

@@ -105,6 +105,10 @@ def closest_point(
     borders between smooth parts. Feet that do not converge are looked for on the four border curves
     (section 3.1 of the paper) and say so.
 
+    The global search can miss the nearest foot where samples are very uneven: next to an edge collapsed to a
+    point, a few queries in ten thousand. On a surface with a jump (a knot as often as its order) the value
+    at the knot is that from the right; a query nearest to the left one is reported as not converged.
+
     Works under `jit`, `vmap` and `grad`. Inside a transformation the global search is by brute force from
     two starts per point, which is slower and may, where three or more feet compete, miss the nearest. The
     derivative is implicit: $d(u, v) = H^{-1} dg$ with $g$ the orthogonality equations and $H$ the Hessian of

@@ -224,8 +224,11 @@ def _pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple
     Settled: the residual's components along the free tangents, lengths, are below the tolerance.
     """
     gs, gt = first.gradient_s, first.gradient_t
-    pinned_s = (box.high_u <= box.low_u) | jnp.where(gs < 0, u <= box.low_u, u >= box.high_u)
-    pinned_t = (box.high_v <= box.low_v) | jnp.where(gt < 0, v <= box.low_v, v >= box.high_v)
+    short = tolerance**2  # moving along so short a tangent changes nothing: curves along v, poles
+    pinned_s = (box.high_u <= box.low_u) | (first.E <= short)
+    pinned_t = (box.high_v <= box.low_v) | (first.G <= short)
+    pinned_s |= jnp.where(gs < 0, u <= box.low_u, u >= box.high_u)
+    pinned_t |= jnp.where(gt < 0, v <= box.low_v, v >= box.high_v)
     settled_s = pinned_s | (gs * gs <= tolerance**2 * first.E)
     settled_t = pinned_t | (gt * gt <= tolerance**2 * first.G)
     return pinned_s, pinned_t, settled_s & settled_t
