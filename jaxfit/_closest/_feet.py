@@ -225,8 +225,8 @@ def _pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple
     """
     gs, gt = first.gradient_s, first.gradient_t
     short = tolerance**2  # moving along so short a tangent changes nothing: curves along v, poles
-    pinned_s = (box.high_u <= box.low_u) | (first.E <= short)
-    pinned_t = (box.high_v <= box.low_v) | (first.G <= short)
+    pinned_s = (box.high_u <= box.low_u) | (short >= first.E)
+    pinned_t = (box.high_v <= box.low_v) | (short >= first.G)
     pinned_s |= jnp.where(gs < 0, u <= box.low_u, u >= box.high_u)
     pinned_t |= jnp.where(gt < 0, v <= box.low_v, v >= box.high_v)
     settled_s = pinned_s | (gs * gs <= tolerance**2 * first.E)
