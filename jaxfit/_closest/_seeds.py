@@ -22,8 +22,8 @@ from jaxfit._splines._pieces import Axis, Pieces
 LEAST_SAMPLES = 24  # per direction, for surfaces of few cells
 CURVE_SAMPLES = 24  # per span of a curve
 MOST_SAMPLES = 400_000  # in all, for nets of very many cells
-SLACK = 1.5  # for steps along u and v that are not at right angles
-SAG = 1.0  # for second derivatives that change between samples
+SLACK = 2.0  # for steps along u and v that are not at right angles
+SAG = 1.5  # for second derivatives that change between samples
 WIDER = 1.5  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
 NEIGHBOURS = (8, 24, 80, 200)  # as many as it takes
