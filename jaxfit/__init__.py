@@ -36,3 +36,12 @@ from jaxfit._splines import clamped_uniform_knots as clamped_uniform_knots
 from jaxfit._splines import greville_abscissae as greville_abscissae
 from jaxfit._splines import insertion_matrix as insertion_matrix
 from jaxfit._splines import merge_knots as merge_knots
+
+
+def __getattr__(name: str) -> object:
+    """Load `jaxfit.io` and `jaxfit.plot` when they are first asked for."""
+    if name in ("io", "plot"):
+        import importlib
+
+        return importlib.import_module(f"jaxfit.{name}")
+    raise AttributeError(f"module 'jaxfit' has no attribute {name!r}")

@@ -103,3 +103,33 @@ def _check_multiplicity(name: str, knots: np.ndarray, order: int, count: int) ->
             f"{name} must repeat no interior knot more than {order} times (the order), but "
             f"{values[i]:g} appears {repeats[i]} times; remove the surplus."
         )
+
+
+def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
+    """Raise unless `value` is an instance of `kind`; `example` says what to pass."""
+    if not isinstance(value, kind):
+        given = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+        raise TypeError(f"{name} must be an object such as {example}, but is {given}; pass {example}.")
+
+
+def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:
+    """Raise unless a concrete `value` is a number, at least `least`, and whole if so asked."""
+    if not is_concrete(value):
+        return
+    kind = "a whole number" if whole else "a number"
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be {kind}, but is {value!r}; pass {kind}.") from error
+    if not number >= least or (whole and number != int(number)):
+        raise ValueError(f"{name} must be {kind} of at least {least:g}, but is {number:g}; raise it.")
+
+
+def check_order(order: Any) -> None:
+    """Raise unless `order` is a pair of whole numbers from 2 to 8."""
+    pair = isinstance(order, (tuple, list)) and len(order) == 2
+    if not pair or not all(isinstance(k, (int, np.integer)) and 2 <= k <= 8 for k in order):
+        raise ValueError(
+            f"order must be a pair (K, L) of whole numbers from 2 to 8, but is {order!r}; pass for instance "
+            "(4, 4)."
+        )

@@ -19,7 +19,6 @@ ROOMS = [
     ("_closest",),
     ("_base",),
     ("_fit",),
-    ("_quality",),
     ("io",),
     ("plot",),
     ("_cli_arguments", "_cli_report"),

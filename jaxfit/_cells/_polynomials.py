@@ -1,4 +1,4 @@
-"""Evaluating polynomial pieces, and summing products of basis functions over the points of a cell."""
+"""Evaluating polynomial pieces with their derivatives, by Horner's rule."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -29,10 +29,6 @@ class Rows(eqx.Module):
         """Per-point values, laid out in rows; empty slots hold some point's value, never NaN."""
         return x[:, jnp.minimum(self.point, x.shape[1] - 1)]
 
-    def gather(self, x: Float[Array, "d rows width"]) -> Float[Array, "d points"]:
-        """Values in rows, back in the order of the points."""
-        return x.reshape(x.shape[0], -1)[:, self.slot_of_point]
-
 
 def row_width(points: int, cells: int) -> int:
     """Width that keeps rows well filled: about half the mean number of points in a cell."""

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import values_at
-from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_concrete
 from jaxfit._closest._feet import Feet
 from jaxfit._closest._implicit import foot_parameters
 from jaxfit._closest._project import project
@@ -79,15 +79,17 @@ def closest_point(
     points : array (points, d)
     start : pair of arrays (points,), optional
         Parameters (u, v) to start from (for a curve just u): the result is then the local minimum that the
-        iteration runs into. Without it the search is global: the spline is sampled several times a
-        cell, and every sample that could lead to a nearer foot is tried.
+        iteration runs into; starts outside the domain are moved to its border. Without it the search is
+        global: the spline is sampled several times a cell, and every sample that could lead to a nearer
+        foot is tried.
     method : Newton() or HuWallner(), optional
         The step (default `Newton()`). Either way a step never increases the distance.
     tolerance : float, optional
         Largest tangential part of the residual, as a fraction of the extent (the diagonal of the box
         around control points and queries). Default 1e-12 in float64, 1e-5 in float32.
     max_steps : int
-        Evaluations for each point before it counts as not converged.
+        At least 1. About as many evaluations are spent on a point, from each start and in each of the places
+        it is looked for, before it counts as not converged.
 
     Returns
     -------
@@ -119,6 +121,11 @@ def closest_point(
     share one compilation.
     """
     method = Newton() if method is None else method
+    check_kind("surface", surface, (BSplineSurface, BSplineCurve), "BSplineSurface(...)")
+    check_kind("method", method, AbstractFootMethod, "Newton()")
+    check_number("max_steps", max_steps, 1, whole=True)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, 0.0)
     net, knots_u, knots_v = as_surface_arrays(surface)
     queries = as_points("points", points, net.shape[-1])
     starts = _checked_start(start, queries.shape[0], isinstance(surface, BSplineCurve))

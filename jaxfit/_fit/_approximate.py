@@ -9,7 +9,14 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base import Boundary, base_surface
-from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._checks import (
+    as_floating,
+    as_points,
+    check_kind,
+    check_number,
+    check_order,
+    is_concrete,
+)
 from jaxfit._closest import closest_point
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_approximation import GeometricApproximation, border
@@ -47,8 +54,8 @@ def approximate(
     method : GeometricApproximation, optional
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
-        diagonal of the data's bounding box; None asks for nothing. Default: 6e-4 (the paper's 0.06 %) on
-        average.
+        diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
+        returned). Default: 6e-4 (the paper's 0.06 %) on average.
     max_steps : int
         Most iterations.
     weights : array (points,), optional
@@ -74,15 +81,19 @@ def approximate(
 
     Notes
     -----
-    Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
-    differentiation. Outside transformations clouds are padded to one of four sizes per octave, so that a
-    second cloud of similar size compiles nothing.
+    Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
+    differentiate through a fit raises a TypeError. Outside transformations clouds are padded to one of four
+    sizes per octave, so that a second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
+    check_kind("method", method, GeometricApproximation, "GeometricApproximation()")
+    check_kind("base", base, BSplineSurface, "base_surface(boundary)")
+    check_number("max_steps", max_steps, 0, whole=True)
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     pulls = _checked_weights(weights, cloud.shape[0])
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
+            check_number("tol_average and tol_maximum", tolerance, 0.0)
             advise_x64(float(tolerance), np.dtype(base.control_points.dtype))
     unit = unit_of(cloud)
     concrete = is_concrete(cloud, base, pulls, start)
@@ -225,11 +236,13 @@ def fit_points(
     ValueError
         As `base_surface` and `approximate` do, and if there is no boundary.
     """
+    check_order(order)
     if boundary is None:
         raise ValueError(
             "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
             "four polylines around the patch."
         )
+    check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, least=LEAST_POINTS)
     net = _default_net(cloud.shape[0], boundary, order) if net is None else net
     base = base_surface(boundary, cloud, net=net, order=order)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._checks import as_floating, is_concrete
+from jaxfit._checks import as_floating, check_kind, check_number, check_order, is_concrete
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_approximation import border
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
@@ -60,11 +60,17 @@ def interpolate(
 
     Notes
     -----
-    Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and forward-mode
-    differentiation. On a closed grid (first row equal to the last) the feet stay on their side of the seam.
+    Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
+    differentiate through a fit raises a TypeError. On a closed grid (first row equal to the last) the feet
+    stay on their side of the seam.
     """
+    check_order(order)
+    check_number("max_steps", max_steps, 0, whole=True)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, 0.0)
     data = _checked_grid(grid, order)
     method = GeometricInterpolation() if method is None else method
+    check_kind("method", method, GeometricInterpolation, "GeometricInterpolation()")
     n, m, d = data.shape
     unit = unit_of(data.reshape(-1, d))
     inner = unit.inward(data)
@@ -121,8 +127,6 @@ def _finished(carry: Any, problem: Any, unit: Any, grid: Any, surface: BSplineSu
 def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
     data = as_floating("grid", grid, 3)
     n, m, d = data.shape
-    if len(order) != 2 or not all(2 <= k <= 8 for k in order):
-        raise ValueError(f"order must be a pair (K, L) of numbers from 2 to 8, but is {order}.")
     if n < order[0] or m < order[1] or d < 1:
         raise ValueError(
             f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._checks import is_concrete
 from jaxfit._fit._results import RESULTS
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Pieces, make_pieces
@@ -148,6 +149,24 @@ def _judge(
     return jax.tree.map(lambda a, b: jnp.where(bad & (carry.step >= 0), a, b), taken_back, good)
 
 
+@jax.custom_jvp
+def without_derivative(carry: Carry) -> Carry:
+    """The same; differentiating through it raises.
+
+    The derivative of the iteration as run is not that of the fit: feet that start converged never move, so
+    their tangents would silently be zero.
+    """
+    return carry
+
+
+@without_derivative.defjvp
+def _refuse(primals: Any, tangents: Any) -> Any:
+    raise TypeError(
+        "a fit has no derivative with respect to its data; differentiate functions of the fitted surface, or "
+        "closest_point, instead."
+    )
+
+
 def run(
     method: AbstractIterativeMethod,
     problem: Any,
@@ -157,7 +176,8 @@ def run(
 ) -> Carry:
     """The whole loop: in one go, or in chunks that take about REPORT_SECONDS with a report after each."""
     if progress is None:
-        return advance(method, problem, limits, limits.max_steps, carry)
+        carry = advance(method, problem, limits, limits.max_steps, carry)
+        return carry if is_concrete(carry) else without_derivative(carry)
     import time
 
     most = int(limits.max_steps)

@@ -13,8 +13,8 @@ class RESULTS(eqx.Enumeration):
         "or loosen the tolerances."
     )
     stalled = (
-        "the errors have stopped falling above the tolerances; use a larger net (more control points), a "
-        "better base surface, or looser tolerances."
+        "the errors have stopped falling above the tolerances; loosen these or, for an approximation, use "
+        "more control points or a better base surface."
     )
     diverged = (
         "the iteration produced numbers that are not finite or errors that grow, and was taken back to the "
