@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.typing import ArrayLike
 
 from jaxfit._base import Boundary, base_surface
@@ -19,7 +20,7 @@ from jaxfit._checks import (
 )
 from jaxfit._closest import closest_point
 from jaxfit._fit._fit_result import Fit, history_of, outcome
-from jaxfit._fit._geometric_approximation import GeometricApproximation, border
+from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, make_problem, padded_start, unit_of
@@ -112,19 +113,15 @@ def approximate(
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     carry = begin(net, u, v, max_steps)
     carry = run(method, problem, limits, carry, progress if concrete else None)
-    surface = _surface(carry, base, unit, method)
+    surface = _surface(carry, base, net, unit)
     parts = _parts(carry, method, problem, cloud.shape[0], max_steps, concrete)
     return _finished(carry, parts, unit, surface, concrete, throw)
 
 
-def _surface(
-    carry: Carry, base: BSplineSurface, unit: Unit, method: GeometricApproximation
-) -> BSplineSurface:
-    """The fitted surface in the user's unit; control points that never move keep every bit."""
+def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
+    """The fitted surface in the user's unit; control points that have not moved keep every bit."""
     moved = jnp.asarray(unit.outward(carry.net), base.control_points.dtype)
-    nu, nv = base.shape
-    held = border(nu, nv, corners_only=not method.fixed_boundary)[..., None]
-    net = jnp.where(held, base.control_points, moved)
+    net = jnp.where(carry.net == begun, base.control_points, moved)
     return BSplineSurface(net, base.knots_u, base.knots_v)
 
 

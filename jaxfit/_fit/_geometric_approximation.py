@@ -4,7 +4,6 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool
 
 from jaxfit._cells import (
     evaluate_values,
@@ -15,11 +14,10 @@ from jaxfit._cells import (
     rows_of,
     staged,
 )
-from jaxfit._closest import AbstractFootMethod, Newton, project
+from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._loop import AbstractIterativeMethod, Measured
+from jaxfit._fit._measure import border, measure_feet
 from jaxfit._splines._pieces import Pieces, span_polynomials
-
-FOOT_STEPS = 40
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -78,24 +76,6 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Feet from the last ones, converged on the new surface."""
-        feet = project(
-            self.foot_method,
-            pieces,
-            problem.target,
-            measured.u,
-            measured.v,
-            problem.foot_tolerance * problem.diagonal,
-            jnp.asarray(FOOT_STEPS, jnp.int32),
-            problem.padding <= 0,
-            borders=False,  # the safeguard keeps the best foot there is; the final check looks again
-        )
-        real = problem.padding > 0
-        error = jnp.where(real, jnp.sqrt(jnp.where(real, feet.best, 0.0)), 0.0)
-        return Measured(feet.best_u, feet.best_v, error, feet.steps, feet.converged)
-
-
-def border(nu: int, nv: int, corners_only: bool) -> Bool[Array, "nu nv"]:
-    """Which control points lie on the border of the net, or only its corners."""
-    end_u = jnp.zeros(nu, bool).at[jnp.asarray([0, nu - 1])].set(True)[:, None]
-    end_v = jnp.zeros(nv, bool).at[jnp.asarray([0, nv - 1])].set(True)[None, :]
-    return end_u & end_v if corners_only else end_u | end_v
+        # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
+        idle = problem.padding <= 0
+        return measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)

@@ -6,13 +6,11 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxfit._cells import values_at
-from jaxfit._closest import AbstractFootMethod, Newton, project
-from jaxfit._fit._geometric_approximation import border
+from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._loop import AbstractIterativeMethod, Measured
+from jaxfit._fit._measure import border, measure_feet
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines._pieces import Pieces
-
-FOOT_STEPS = 40
 
 
 class GeometricInterpolation(AbstractIterativeMethod):
@@ -59,15 +57,4 @@ class GeometricInterpolation(AbstractIterativeMethod):
             for knots, k in zip((problem.knots_u, problem.knots_v), pieces.order, strict=True)
         )
         corners = border(nu, nv, corners_only=True).reshape(-1)
-        feet = project(
-            self.foot_method,
-            pieces,
-            problem.target,
-            measured.u,
-            measured.v,
-            problem.foot_tolerance * problem.diagonal,
-            jnp.asarray(FOOT_STEPS, jnp.int32),
-            corners,
-        )
-        error = jnp.where(corners, 0.0, jnp.sqrt(jnp.where(corners, 0.0, feet.best)))
-        return Measured(feet.best_u, feet.best_v, error, feet.steps, feet.converged)
+        return measure_feet(self.foot_method, problem, pieces, measured, corners, borders=True)

@@ -9,9 +9,9 @@ from jax.typing import ArrayLike
 
 from jaxfit._checks import as_floating, check_kind, check_number, check_order, is_concrete
 from jaxfit._fit._fit_result import Fit, history_of, outcome
-from jaxfit._fit._geometric_approximation import border
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._loop import Limits, begin, run
+from jaxfit._fit._measure import border
 from jaxfit._fit._problem import make_problem, unit_of
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import advise_x64
