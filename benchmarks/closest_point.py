@@ -24,9 +24,9 @@ import helpers
 
 from jaxfit import BSplineSurface, HuWallner, Newton, closest_point
 from jaxfit._base import Boundary, base_surface
-from jaxfit._closest._closest_point import _describe, extent, prepare
+from jaxfit._closest import prepare
 from jaxfit._closest._project import project
-from jaxfit._closest._seeds import Search
+from jaxfit._closest._rivals import Search
 from jaxfit._splines._pieces import as_surface_arrays
 
 BASES = {"blade_wrap_3000": (24, 40), "mannequin_head": (42, 42)}

@@ -19,13 +19,14 @@ def assert_rows(cell, cells, width):
     count, width_of_rows = point.shape
     assert width_of_rows == width
     assert count <= len(cell) // width + min(cells, len(cell))
+    assert rows.used == np.sum(-(-np.bincount(cell[cell < cells], minlength=cells) // width))
     filled = np.asarray(rows.filled)
     np.testing.assert_array_equal(np.sort(point[filled]), taking_part)
     assert (point[~filled] == len(cell)).all()
     owner = np.broadcast_to(np.asarray(rows.cell)[:, None], point.shape)
     np.testing.assert_array_equal(owner[filled], cell[point[filled]])
-    slot = np.asarray(rows.slot_of_point)[taking_part]
-    np.testing.assert_array_equal(point.reshape(-1)[slot], taking_part)
+    assert filled[: rows.used, 0].all()
+    assert not filled[rows.used :].any()
     return rows
 
 
@@ -55,13 +56,23 @@ def test_words_too_long_to_pack_are_sorted_all_the_same():
 
 
 @pytest.mark.float32_too
-def test_spread_and_gather_are_inverse():
+def test_spread_puts_values_where_the_points_are():
     cell = np.random.default_rng(0).integers(0, CELLS, POINTS).astype(np.int32)
     rows = assert_rows(cell, CELLS, 8)
     x = jnp.asarray(np.random.default_rng(1).normal(size=(2, POINTS)))
     there = rows.spread(x)
     assert np.isfinite(there).all()
-    np.testing.assert_array_equal(there.reshape(len(x), -1)[:, rows.slot_of_point], x)
+    np.testing.assert_array_equal(there[:, rows.filled], x[:, rows.point[rows.filled]])
+
+
+@pytest.mark.float32_too
+def test_rows_of_one_point_each():
+    cell = np.random.default_rng(2).integers(0, CELLS + 1, POINTS).astype(np.int32)
+    rows = compiled(jnp.asarray(cell), CELLS, 1)
+    taking_part = np.flatnonzero(cell < CELLS)
+    assert rows.used == taking_part.size
+    np.testing.assert_array_equal(np.sort(rows.point[: rows.used, 0]), taking_part)
+    np.testing.assert_array_equal(rows.cell[: rows.used], cell[rows.point[: rows.used, 0]])
 
 
 def test_rows_get_wider_with_more_points_in_a_cell():

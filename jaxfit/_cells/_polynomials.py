@@ -1,5 +1,6 @@
 """Evaluating polynomial pieces with their derivatives, by Horner's rule."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -7,59 +8,55 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-Coordinates = list[Array]  # one array per space coordinate, all of one shape
-
 
 class Jet(NamedTuple):
-    """Value and derivatives up to second order, in local coordinates, a list of coordinates each."""
+    """Value and derivatives up to second order, in local coordinates, the space coordinate first."""
 
-    value: Coordinates
-    s: Coordinates
-    t: Coordinates
-    ss: Coordinates
-    st: Coordinates
-    tt: Coordinates
+    value: Float[Array, "d ..."]
+    s: Float[Array, "d ..."]
+    t: Float[Array, "d ..."]
+    ss: Float[Array, "d ..."]
+    st: Float[Array, "d ..."]
+    tt: Float[Array, "d ..."]
 
 
-def evaluate_jet(coefficients: Float[Array, "d K L ..."], s: Array, t: Array) -> Jet:
-    """Horner's rule for the value and all derivatives up to order two.
+def evaluate_jet(
+    coefficients: Float[Array, "d K L ..."], s: Float[Array, "..."], t: Float[Array, "..."]
+) -> Jet:
+    """Value and all derivatives up to order two.
 
     `coefficients` broadcasts against `s` and `t`: one value per row for points in rows, one per point
-    elsewhere. Structure of arrays throughout, so that everything fuses into a single vector loop.
+    elsewhere. Each derivative is a rule of its own: as vector loops over points, six short ones compile and
+    run faster than one that shares everything.
     """
-    jets = [_jet_of_one(coordinate, s, t) for coordinate in coefficients]
-    return Jet(*(list(parts) for parts in zip(*jets, strict=True)))
+    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    return Jet(*(_partial(coefficients, s, t, i, j) for i, j in orders))
 
 
-def _jet_of_one(c: Float[Array, "K L ..."], s: Array, t: Array) -> tuple[Array, ...]:
-    in_t = [_horner(list(row), t) for row in c]
-    value, first, second = _horner([f for f, _, _ in in_t], s)
-    in_t1, mixed, _ = _horner([f for _, f, _ in in_t], s)
-    in_t2, _, _ = _horner([f for _, _, f in in_t], s)
-    return value, first, in_t1, second, mixed, in_t2
+def evaluate_values(
+    coefficients: Float[Array, "d K L ..."], s: Float[Array, "..."], t: Float[Array, "..."]
+) -> Float[Array, "d ..."]:
+    """The value alone."""
+    return _partial(coefficients, s, t, 0, 0)
 
 
-def _horner(c: Sequence[Array], x: Array) -> tuple[Array, Array, Array]:
-    """p(x), p'(x), p''(x) for p with coefficients c[0] + c[1] x + ..., by nested multiplication."""
-    p = c[-1] + jnp.zeros_like(x)
-    first = second = jnp.zeros_like(x)
-    for degree, coefficient in enumerate(reversed(c[:-1])):
-        if degree > 1:
-            second = second * x + 2.0 * first
-        elif degree == 1:
-            second = 2.0 * first
-        first = p if degree == 0 else first * x + p
-        p = p * x + coefficient
-    return p, first, second
+def _partial(c: Array, s: Array, t: Array, i: int, j: int) -> Array:
+    """The derivative of order (i, j)."""
+    order_u, order_v = c.shape[1:3]
+    rows = [horner([c[:, a, b] for b in range(order_v)], t[None], j) for a in range(order_u)]
+    shape = (c.shape[0], *jnp.broadcast_shapes(c.shape[3:], s.shape))
+    return jnp.broadcast_to(horner(rows, s[None], i), shape)
 
 
-def evaluate_values(coefficients: Float[Array, "d K L ..."], s: Array, t: Array) -> Coordinates:
-    """Horner's rule for the value alone."""
-
-    def value(c: Sequence[Array], x: Array) -> Array:
-        p = c[-1] + jnp.zeros_like(x)
-        for coefficient in reversed(c[:-1]):
-            p = p * x + coefficient
-        return p
-
-    return [value([value(list(row), t) for row in c], s) for c in coefficients]
+def horner(c: Sequence[Array], x: Array, derivative: int) -> Array:
+    """p(x), p'(x) or p''(x) for p with coefficients c[0] + c[1] x + ..., by nested multiplication."""
+    terms = []
+    for power in range(derivative, len(c)):
+        factor = math.perm(power, derivative)
+        terms.append(c[power] if factor == 1 else float(factor) * c[power])
+    if not terms:
+        return jnp.zeros_like(c[0])
+    result = terms[-1]
+    for term in reversed(terms[:-1]):
+        result = result * x + term
+    return result

@@ -10,24 +10,33 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
-
+from jaxtyping import Bool, Int, Shaped
 
 class Rows(eqx.Module):
-    """Where every point sits: `point[row, slot]` is its number, or `points` for an empty slot."""
+    """Where every point sits: `point[row, slot]` is its number, or `points` for an empty slot.
+
+    The first `used` rows hold points, the others none. Points that take no part have no slot.
+    """
 
     cell: Int[Array, " rows"]
     point: Int[Array, "rows width"]
-    slot_of_point: Int[Array, " points"]
+    used: Int[Array, ""]
+    points: int = eqx.field(static=True)
 
     @property
     def filled(self) -> Bool[Array, "rows width"]:
         """Which slots hold a point."""
-        return self.point < self.slot_of_point.shape[0]
+        return self.point < self.points
 
-    def spread(self, x: Float[Array, "d points"]) -> Float[Array, "d rows width"]:
+    def spread(self, x: Shaped[Array, "d points"]) -> Shaped[Array, "d rows width"]:
         """Per-point values, laid out in rows; empty slots hold some point's value, never NaN."""
-        return x[:, jnp.minimum(self.point, x.shape[1] - 1)]
+        return x[:, jnp.minimum(self.point, self.points - 1)]
+
+    def block(self, start: Int[Array, ""], size: int) -> "Rows":
+        """`size` of the rows (moved back where fewer are left)."""
+        cell = lax.dynamic_slice_in_dim(self.cell, start, size)
+        point = lax.dynamic_slice_in_dim(self.point, start, size)
+        return Rows(cell, point, self.used, self.points)
 
 
 def row_width(points: int, cells: int) -> int:
@@ -36,29 +45,27 @@ def row_width(points: int, cells: int) -> int:
     return 8 if mean < 24 else 16 if mean < 400 else 32
 
 
+def row_count(points: int, cells: int, width: int) -> int:
+    """Rows enough for any distribution of the points."""
+    return points // width + min(cells, points) if width > 1 else points
+
+
 def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
     """Sort points by their cell number and cut them into rows; numbers >= cells take no part."""
     points = cell.shape[0]
-    count = points // width + min(cells, points)
     ordered, order = sort_by_cell(cell, cells)
-    start = jnp.searchsorted(ordered, jnp.arange(cells + 1, dtype=ordered.dtype)).astype(jnp.int32)
-    per_cell = -((start[:-1] - start[1:]) // width)
-    first_row = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(per_cell, dtype=jnp.int32)])
-    # Rows to points: row r of cell c holds sorted positions start[c] + (r - first_row[c]) * width ...
-    row = jnp.arange(count, dtype=jnp.int32)
-    owner = jnp.searchsorted(first_row, row, side="right").astype(jnp.int32) - 1
-    owner = jnp.minimum(owner, cells - 1)
-    begin = start[owner] + (row - first_row[owner]) * width
-    position = begin[:, None] + jnp.arange(width, dtype=jnp.int32)[None, :]
-    holds = (position < start[owner + 1][:, None]) & (row < first_row[-1])[:, None]
-    point = jnp.where(holds, order[jnp.clip(position, 0, points - 1)], points)
-    # ... and points to slots, the inverse.
-    home = jnp.minimum(ordered, cells - 1).astype(jnp.int32)
-    offset = jnp.arange(points, dtype=jnp.int32) - start[home]
-    slot = first_row[home] * width + offset
-    slot = jnp.clip(slot, 0, count * width - 1)
-    slot_of_point = jnp.zeros(points, jnp.int32).at[order].set(slot, unique_indices=True)
-    return Rows(owner, point, slot_of_point)
+    members = jnp.zeros(cells + 1, jnp.int32).at[jnp.minimum(cell, cells)].add(1)
+    sizes = jnp.stack([members, -(-members // width)])
+    until = jnp.cumsum(sizes, axis=1, dtype=jnp.int32)
+    start, first_row = until - sizes
+    # Sorted position p of cell c sits in slot (first row of c) * width + (p - first position of c).
+    slot = jnp.arange(points, dtype=jnp.int32) + (first_row * width - start)[ordered]
+    slot = jnp.where(ordered < cells, slot, jnp.iinfo(jnp.int32).max)
+    # Rows enough for any distribution of the points.
+    count = points // width + min(cells, points) if width > 1 else points
+    owner = jnp.zeros(count, jnp.int32).at[slot // width].set(ordered, mode="drop")
+    table = jnp.full(count * width, points, jnp.int32).at[slot].set(order, mode="drop")
+    return Rows(owner, table.reshape(count, width), until[1, cells - 1], points)
 
 
 def sort_by_cell(
@@ -73,6 +80,7 @@ def sort_by_cell(
     bits = max(points - 1, 1).bit_length()
     number = jnp.arange(points, dtype=jnp.int32)
     word = _word(bits + cells.bit_length())
+    cell = jnp.minimum(cell, cells)
     if word is None:
         ordered, order = lax.sort((cell.astype(jnp.int32), number), num_keys=1, is_stable=True)
         return ordered, order

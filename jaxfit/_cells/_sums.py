@@ -8,7 +8,7 @@ are linear images of the moments sum_k w_k s_k^a t_k^b x_k. Moments are sums alo
 one cell are added up, and the image is one fixed matrix per span and direction.
 """
 
-from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,13 +56,19 @@ def _cells_to_net(
     poly_u: Float[Array, "spans_u K K"],
     poly_v: Float[Array, "spans_v L L"],
 ) -> Float[Array, "nu nv c"]:
+    """One direction at a time: moments into sums for the basis functions of a span, then spans overlapped."""
     (spans_u, order_u, _), (spans_v, order_v, _) = poly_u.shape, poly_v.shape
-    c = moments.shape[-1]
-    x = moments.reshape(spans_u, spans_v, order_u, order_v, c)
-    image = partial(jnp.einsum, precision="highest")
-    x = image("ira,jsb,ijabc->rsijc", poly_u, poly_v, x)
-    net = jnp.zeros((spans_u + order_u - 1, spans_v + order_v - 1, c), moments.dtype)
-    for r in range(order_u):
-        for q in range(order_v):
-            net = net.at[r : r + spans_u, q : q + spans_v].add(x[r, q])
-    return net
+    x = moments.reshape(spans_u, spans_v, order_u, order_v, -1)
+    terms = [
+        sum(poly_v[None, :, None, q, b, None] * x[:, :, :, b] for b in range(order_v)) for q in range(order_v)
+    ]
+    x = _overlapped(terms, 1)
+    terms = [sum(poly_u[:, None, r, a, None] * x[:, :, a] for a in range(order_u)) for r in range(order_u)]
+    return _overlapped(terms, 0)
+
+
+def _overlapped(terms: list[Any], axis: int) -> Any:
+    """The sum of the terms, each one place farther along `axis`."""
+    last = len(terms) - 1
+    shifts = [[(i, last - i) if k == axis else (0, 0) for k in range(x.ndim)] for i, x in enumerate(terms)]
+    return sum(jnp.pad(x, shift) for x, shift in zip(terms, shifts, strict=True))

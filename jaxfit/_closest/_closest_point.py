@@ -1,7 +1,6 @@
 """The closest point on a curve or surface, for many points at once."""
 
 import enum
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,17 +11,14 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import values_at
 from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_concrete
-from jaxfit._closest._feet import Feet
 from jaxfit._closest._implicit import foot_parameters
-from jaxfit._closest._project import project
-from jaxfit._closest._seeds import Samples, Search, sample
+from jaxfit._closest._on_host import feet_on_host
 from jaxfit._closest._steps import AbstractFootMethod, Newton
-from jaxfit._precision import advise_x64, bucket, default_foot_tolerance
+from jaxfit._precision import advise_x64, default_foot_tolerance
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface
-from jaxfit._splines._pieces import Pieces, as_surface_arrays, make_pieces
+from jaxfit._splines._pieces import as_surface_arrays, make_axis
 
 
 class PointStatus(enum.IntEnum):
@@ -162,58 +158,11 @@ def _checked_start(start: Any, count: int, curve: bool) -> tuple[Any, Any] | Non
     return checked[0], checked[1]
 
 
-class Prepared(eqx.Module):
-    """A surface made ready for many queries: centred pieces, and samples to start from."""
-
-    pieces: Pieces
-    centre: Float[Array, " d"]
-    samples: Samples | None
-
-
-@partial(jax.jit, static_argnames="sampled")
-def prepare(net: Array, knots_u: Array, knots_v: Array, sampled: bool) -> Prepared:
-    """Pieces about the middle of the net, where coordinates carry the least rounding."""
-    centre = 0.5 * (jnp.min(net, axis=(0, 1)) + jnp.max(net, axis=(0, 1)))
-    pieces = make_pieces(net - centre[None, None, :], knots_u, knots_v)
-    return Prepared(pieces, centre, sample(pieces) if sampled else None)
-
-
-def extent(net: Any, points: Any) -> float:
-    """Diagonal of the box around control points and queries (concrete)."""
-    net, points = np.asarray(net), np.asarray(points)
-    low = np.minimum(net.min(axis=(0, 1)), points.min(axis=0)).astype(np.float64)
-    high = np.maximum(net.max(axis=(0, 1)), points.max(axis=0)).astype(np.float64)
-    return float(np.linalg.norm(high - low))
-
-
-@partial(jax.jit, static_argnames="method")
-def _run(
-    method: AbstractFootMethod,
-    pieces: Pieces,
-    target: Array,
-    u: Array,
-    v: Array,
-    idle: Array,
-    tolerance: Array,
-    max_steps: Array,
-) -> Feet:
-    return project(method, pieces, target, u, v, tolerance, max_steps, idle)
-
-
-@jax.jit
-def _describe(
-    pieces: Pieces, u: Array, v: Array, converged: Array
-) -> tuple[Float[Array, "d points"], Int[Array, " points"]]:
-    """Foot points (centred) and their status."""
-    curve = pieces.coefficients.shape[-1] == 1
-    status = _status(pieces.axis_u.breaks, pieces.axis_v.breaks, u, v, converged, curve)
-    return values_at(pieces, u, v), status
-
-
-def _status(breaks_u: Array, breaks_v: Array, u: Array, v: Array, converged: Array, curve: bool) -> Array:
-    at_u = ((u <= breaks_u[0]) | (u >= breaks_u[-1])).astype(jnp.int32)
-    at_v = ((v <= breaks_v[0]) | (v >= breaks_v[-1])).astype(jnp.int32)
-    return jnp.where(converged, at_u if curve else at_u + at_v, int(PointStatus.NOT_CONVERGED))
+def _status(breaks_u: Any, breaks_v: Any, u: Any, v: Any, converged: Any, curve: bool) -> Any:
+    at_u = ((u <= breaks_u[0]) | (u >= breaks_u[-1])).astype(np.int32)
+    at_v = ((v <= breaks_v[0]) | (v >= breaks_v[-1])).astype(np.int32)
+    xp: Any = np if is_concrete(u, v, converged) else jnp
+    return xp.where(converged, at_u if curve else at_u + at_v, np.int32(PointStatus.NOT_CONVERGED))
 
 
 def _on_host(
@@ -224,81 +173,16 @@ def _on_host(
     tolerance: float,
     max_steps: int,
 ) -> ClosestPoint:
-    """Concrete queries: padded to a bucket, global by a k-d tree on the samples if there is no start."""
-    net = arrays[0]
-    dtype = np.dtype(net.dtype)
-    prepared = prepare(*arrays, sampled=start is None)
-    count = points.shape[0]
-    size = bucket(count)
-    centred = np.asarray(points, np.float64) - np.asarray(prepared.centre, np.float64)
-    limits = (
-        jnp.asarray(tolerance * extent(net, points), dtype),
-        jnp.asarray(max_steps, jnp.int32),
-    )
-
-    def feet_from(which: Any, u: Any, v: Any) -> dict[str, np.ndarray]:
-        """Feet of the points `which`, from (u, v); always the same shapes."""
-        target = jnp.asarray(_padded(centred[which], size).T.astype(dtype))
-        starts = (jnp.asarray(_padded(np.asarray(x), size).astype(dtype)) for x in (u, v))
-        idle = np.arange(size) >= len(u)
-        feet = _run(method, prepared.pieces, target, *starts, idle, *limits)
-        fields = dict(u=feet.best_u, v=feet.best_v, f=feet.best, ok=feet.converged, n=feet.steps)
-        return {name: np.array(x)[: len(u)] for name, x in fields.items()}
-
-    if start is not None:
-        best = feet_from(slice(None), *start)
-    else:
-        best = globally(feet_from, prepared.samples, centred, size)
-    padded = (jnp.asarray(_padded(best[name], size)) for name in ("u", "v", "ok"))
-    point, status = _describe(prepared.pieces, *padded)
-    shifted = np.asarray(point).T[:count] + np.asarray(prepared.centre)
+    net, knots_u, knots_v = arrays
+    orders = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
+    axes = make_axis(knots_u, orders[0]), make_axis(knots_v, orders[1])
+    best = feet_on_host(method, net, *axes, np.asarray(points), start, tolerance, max_steps)
+    u, v, f, converged = (best[name] for name in ("u", "v", "f", "converged"))
+    status = _status(*(axis.breaks for axis in axes), u, v, converged, curve=orders[1] == 1)
     with np.errstate(invalid="ignore"):
-        distance = np.sqrt(best["f"])
-    fields = (best["u"], best["v"], shifted, distance)
-    flags = (best["ok"], np.asarray(status)[:count], best["n"])
+        distance = np.sqrt(f)
     # Not jnp.asarray, which compiles a copy for every new size.
-    return ClosestPoint(*(jax.device_put(x) for x in (*fields, *flags)))
-
-
-def globally(feet_from: Any, samples: Samples, points: np.ndarray, size: int) -> dict[str, np.ndarray]:
-    """The nearest foot of all: from the nearest sample, then from every rival that is left.
-
-    `feet_from(which, u, v)` gives the feet of some points from starts, at most `size` at a time.
-    """
-    search = Search(samples, points)
-    best = feet_from(slice(None), *search.nearest())
-    distance = np.sqrt(best["f"].astype(np.float64))
-    rivals = search.rivals(best["u"], best["v"], distance)
-    which, u, v = rivals.first()
-    if which.size:
-        other = feet_from(which, u, v)
-        everywhere_u, everywhere_v = best["u"].copy(), best["v"].copy()
-        everywhere_u[which], everywhere_v[which] = other["u"], other["v"]
-        rivals.found(everywhere_u, everywhere_v)
-        _take_nearer(best, which, other)
-    which, u, v = rivals.rest()
-    for begin in range(0, which.size, size):
-        part = slice(begin, begin + size)
-        _take_nearer(best, which[part], feet_from(which[part], u[part], v[part]))
-    return best
-
-
-def _take_nearer(best: dict[str, np.ndarray], which: np.ndarray, other: dict[str, np.ndarray]) -> None:
-    """Replace feet by nearer ones; `which` may name a point several times."""
-    np.add.at(best["n"], which, other["n"])
-    # Of each point's, the converged ones first and of these the nearest.
-    order = np.lexsort((other["f"], ~other["ok"], which))
-    first = order[np.unique(which[order], return_index=True)[1]]
-    mine = which[first]
-    nearer = other["f"][first] < best["f"][mine]
-    nearer &= other["ok"][first] | ~best["ok"][mine]
-    for name in ("u", "v", "f", "ok"):
-        best[name][mine[nearer]] = other[name][first[nearer]]
-
-
-def _padded(x: np.ndarray, size: int) -> np.ndarray:
-    """Rows repeated at the end up to `size`."""
-    return np.concatenate([x, np.repeat(x[-1:], size - len(x), axis=0)])
+    return ClosestPoint(*jax.device_put((u, v, best["point"], distance, converged, status, best["steps"])))
 
 
 def _traced(

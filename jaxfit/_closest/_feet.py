@@ -4,8 +4,6 @@ A step that increases the distance (beyond rounding) is halved back towards the 
 accepted distances never increase. A bound is active where the gradient points out of it.
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
@@ -16,31 +14,30 @@ from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 4.0  # in local coordinates: two cells
+# In units of a cell's half width: where its polynomial is the surface, and where it still leads on.
+INSIDE, NEAR = 1.0 + 1e-6, 2.0
+# The error foreseen after a step may be this share of the tolerance, for the foot to count as found.
+FORESIGHT = 0.1
+
+GOING, ARRIVED, GIVEN_UP = 0, 1, 2
+UNJUDGED = -1  # in place of the number of halvings: the trial comes from a continued polynomial
 
 
 class Feet(eqx.Module):
     """Trial parameters, and the best (last accepted) foot of every point.
 
-    Two stacks of arrays rather than nine arrays: gathering, scattering and choosing then compile once each.
+    Two stacks of arrays rather than eight arrays: gathering, scattering and choosing then compile once each.
     """
 
     real: Float[Array, "5 *shape"]
-    whole: Int[Array, "4 *shape"]
+    whole: Int[Array, "3 *shape"]
 
     @staticmethod
     def of(
-        u: Array,
-        v: Array,
-        best_u: Array,
-        best_v: Array,
-        best: Array,
-        halvings: Array,
-        steps: Array,
-        done: Array,
-        converged: Array,
+        u: Array, v: Array, best_u: Array, best_v: Array, best: Array, halvings: Array, steps: Array, state: Array
     ) -> "Feet":
         """Stack the parts."""
-        numbers = [x.astype(jnp.int32) for x in (halvings, steps, done, converged)]
+        numbers = [x.astype(jnp.int32) for x in (halvings, steps, state)]
         return Feet(jnp.stack([u, v, best_u, best_v, best]), jnp.stack(numbers))
 
     @property
@@ -70,7 +67,7 @@ class Feet(eqx.Module):
 
     @property
     def halvings(self) -> Int[Array, "*shape"]:
-        """How often the present step has been halved."""
+        """How often the present step has been halved, or UNJUDGED."""
         return self.whole[0]
 
     @property
@@ -79,23 +76,25 @@ class Feet(eqx.Module):
         return self.whole[1]
 
     @property
-    def done(self) -> Bool[Array, "*shape"]:
-        """Whether nothing more is to be tried."""
-        return self.whole[2] > 0
+    def state(self) -> Int[Array, "*shape"]:
+        """GOING, ARRIVED at a foot to the tolerance, or GIVEN_UP."""
+        return self.whole[2]
 
     @property
     def converged(self) -> Bool[Array, "*shape"]:
         """Whether the foot has been found to the tolerance."""
-        return self.whole[3] > 0
+        return self.state == ARRIVED
 
-    def marked(self, done: Array, converged: Array) -> "Feet":
-        """The same feet with other flags."""
-        flags = jnp.stack([done.astype(jnp.int32), converged.astype(jnp.int32)])
-        return Feet(self.real, jnp.concatenate([self.whole[:2], flags]))
+    def standing(self, state: Int[Array, "*shape"]) -> "Feet":
+        """The same feet in another state."""
+        return Feet(self.real, jnp.concatenate([self.whole[:2], state[None].astype(jnp.int32)]))
 
 
 class Box(eqx.Module):
-    """Bounds on the parameters, and the local coordinates of the cell the feet are in."""
+    """Bounds on the parameters, and the local coordinates of the cell whose polynomial is evaluated.
+
+    A rate is 1 over half the cell's width: multiplying is cheaper than dividing.
+    """
 
     low_u: Array
     high_u: Array
@@ -103,87 +102,138 @@ class Box(eqx.Module):
     high_v: Array
     centre_u: Array
     half_u: Array
+    rate_u: Array
     centre_v: Array
     half_v: Array
+    rate_v: Array
 
 
-def new_feet(u: Float[Array, "..."], v: Float[Array, "..."]) -> Feet:
+class Limits(eqx.Module):
+    """What a foot has to reach, and with how many evaluations.
+
+    `tolerance` is the allowed tangential part of the residual, a length; `noise` the rounding of one.
+    """
+
+    tolerance: Float[Array, ""]
+    noise: Float[Array, ""]
+    steps: Int[Array, ""]
+
+    def slack(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Rounding of a squared distance."""
+        return self.noise * (2.0 * jnp.sqrt(f) + self.noise)
+
+
+def new_feet(u: Float[Array, "*shape"], v: Float[Array, "*shape"]) -> Feet:
     """Feet that have not been evaluated yet."""
     zero = jnp.zeros(u.shape, jnp.int32)
-    no = jnp.zeros(u.shape, bool)
-    return Feet.of(u, v, u, v, jnp.full_like(u, jnp.inf), zero, zero, no, no)
+    return Feet.of(u, v, u, v, jnp.full_like(u, jnp.inf), zero, zero, zero)
+
+
+def is_going(feet: Feet, limits: Limits) -> Bool[Array, "*shape"]:
+    """Which feet are to be moved on."""
+    return (feet.state == GOING) & (feet.steps < limits.steps)
 
 
 def advance(
     method: AbstractFootMethod,
     feet: Feet,
-    target: list[Array],
-    coefficients: Array,
+    target: Float[Array, "d *shape"],
+    coefficients: Float[Array, "d K L ..."],
     box: Box,
-    tolerance: Array,
-    noise: Array,
+    limits: Limits,
 ) -> Feet:
     """Evaluate every trial, accept or halve it, and propose the next one.
 
-    `tolerance` is the allowed tangential part of the residual, a length; `noise` the rounding of one.
-    Feet that are done stay as they are.
+    Distances are judged where the cell's polynomial is the surface. A little outside, where it differs by
+    third order from its neighbour, it still proposes a trial; farther out a foot waits for its own cell.
     """
-    always = tolerance < jnp.inf
-    first = staged(always, measure_at(method), feet.u, feet.v, target, coefficients, box)
-    f = first.f
-    next_u, next_v = staged(always, next_trial(method, True), first, feet.u, feet.v, box, tolerance)
-    accepted = f <= feet.best + noise * (2.0 * jnp.sqrt(f) + noise)
-    still = (next_u == feet.u) & (next_v == feet.v)
-    back_u, back_v = 0.5 * (feet.u + feet.best_u), 0.5 * (feet.v + feet.best_v)
-    spent = (feet.halvings >= MOST_HALVINGS) | ((back_u == feet.best_u) & (back_v == feet.best_v))
-    arrived = accepted & still
-    done = arrived | (~accepted & spent)
-    best_u = jnp.where(accepted, feet.u, feet.best_u)
-    best_v = jnp.where(accepted, feet.v, feet.best_v)
-    moved = Feet.of(
-        u=jnp.where(done, best_u, jnp.where(accepted, next_u, back_u)),
-        v=jnp.where(done, best_v, jnp.where(accepted, next_v, back_v)),
-        best_u=best_u,
-        best_v=best_v,
-        best=jnp.where(accepted, f, feet.best),
-        halvings=jnp.where(accepted, 0, feet.halvings + 1),
-        steps=feet.steps + 1,
-        done=done,
-        converged=arrived,
-    )
-    return keep(feet.done, feet, moved)
+    always = limits.tolerance < jnp.inf
+    u, v, best_u, best_v, best = feet.real
+    halvings, steps, _ = feet.whole
+    first = _measure_at(method, always, u, v, target, coefficients, box)
+    next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, box, limits)
+    off = jnp.maximum(jnp.abs(u - box.centre_u) * box.rate_u, jnp.abs(v - box.centre_v) * box.rate_v)
+    going = is_going(feet, limits)
+    judged = going & (off <= INSIDE)
+    led_on = going & (off > INSIDE) & (off <= NEAR) & (halvings <= 0)
+
+    accepted = first.f <= best + limits.slack(first.f)
+    still = (next_u == u) & (next_v == v)
+    # What is foreseen rests on the last two steps, so both must have been judged.
+    certain = still | (foreseen & (halvings == 0))
+    back_u, back_v = 0.5 * (u + best_u), 0.5 * (v + best_v)
+    spent = (halvings >= MOST_HALVINGS) | ((back_u == best_u) & (back_v == best_v))
+    moves = led_on | (judged & accepted)
+    taken = judged & accepted
+    returns = judged & ~accepted
+    leaps = taken & certain
+    here_u, here_v, here = (jnp.where(leaps, x, y) for x, y in ((next_u, u), (next_v, v), (after, first.f)))
+    real = [
+        jnp.where(moves, next_u, jnp.where(returns, back_u, u)),
+        jnp.where(moves, next_v, jnp.where(returns, back_v, v)),
+        jnp.where(taken, here_u, best_u),
+        jnp.where(taken, here_v, best_v),
+        jnp.where(taken, here, best),
+    ]
+    counted = jnp.where(led_on, UNJUDGED, jnp.where(taken, 0, jnp.where(returns, halvings + 1, halvings)))
+    counted = jnp.where(returns & (halvings < 0), 1, counted)
+    state = jnp.where(leaps, ARRIVED, jnp.where(returns & spent, GIVEN_UP, feet.state))
+    numbers = [counted, steps + (judged | led_on), state]
+    return Feet(jnp.stack(real), jnp.stack([x.astype(jnp.int32) for x in numbers]))
 
 
-def measure_at(method: AbstractFootMethod) -> Callable[..., Forms]:
-    """The function of parameters, targets, coefficients and box that gives the inner products there."""
+def _measure_at(
+    method: AbstractFootMethod,
+    always: Array,
+    u: Array,
+    v: Array,
+    target: Array,
+    coefficients: Array,
+    box: Box,
+) -> Forms:
+    """The inner products at the trials."""
+    s = (u - box.centre_u) * box.rate_u
+    t = (v - box.centre_v) * box.rate_v
+    jet = staged(always, evaluate_jet, coefficients, s, t)
+    return staged(always, lambda target, jet: measure(target - jet.value, jet, method.drift), target, jet)
 
-    def at(u: Array, v: Array, target: list[Array], coefficients: Array, box: Box) -> Forms:
-        s = (u - box.centre_u) / box.half_u
-        t = (v - box.centre_v) / box.half_v
-        jet = evaluate_jet(coefficients, s, t)
-        e = [q - x for q, x in zip(target, jet.value, strict=True)]
-        return measure(e, jet, method.drift)
 
-    return at
-
-
-def next_trial(method: AbstractFootMethod, careful: bool) -> Callable[..., tuple[Array, Array]]:
-    """The function of inner products and parameters that takes a step.
-
-    A foot that has settled, or is held at its bounds, gets its own parameters back. `careful` limits the
-    step's length and sees to it that it leads downhill.
+def _next_trial(
+    method: AbstractFootMethod,
+    first: Forms,
+    u: Array,
+    v: Array,
+    best: Array,
+    box: Box,
+    limits: Limits,
+) -> tuple[Array, Array, Array, Array]:
+    """Take a step: the next parameters, the squared distance there to third order, and whether the foot is
+    foreseen to be found there. A foot that has settled, or is held at its bounds, gets its own parameters back.
     """
+    always = limits.tolerance < jnp.inf
+    pinned_s, pinned_t, settled = _pins(first, u, v, box, limits.tolerance)
+    ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
+    ds, dt = staged(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
+    return staged(always, _foresee, first, u, v, ds, dt, best, box, limits)
 
-    def after(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array]:
-        pinned_s, pinned_t, settled = _pins(first, u, v, box, tolerance)
-        ds, dt = method.step(first, pinned_s, pinned_t)
-        if careful:
-            ds, dt = _downhill(first, u, v, ds, dt, pinned_s, pinned_t, box)
-        next_u = jnp.clip(u + jnp.where(settled, 0.0, ds * box.half_u), box.low_u, box.high_u)
-        next_v = jnp.clip(v + jnp.where(settled, 0.0, dt * box.half_v), box.low_v, box.high_v)
-        return next_u, next_v
 
-    return after
+def _foresee(
+    first: Forms, u: Array, v: Array, ds: Array, dt: Array, best: Array, box: Box, limits: Limits
+) -> tuple[Array, Array, Array, Array]:
+    free_u, free_v = u + ds * box.half_u, v + dt * box.half_v
+    next_u, next_v = jnp.clip(free_u, box.low_u, box.high_u), jnp.clip(free_v, box.low_v, box.high_v)
+    # Half the fall to come, |step|^2 in the metric of the Hessian; and the last step's fall.
+    fall = first.gradient_s * ds + first.gradient_t * dt
+    before = jnp.where(best < jnp.inf, best - first.f, 0.0)
+    # Quadratic convergence: steps of length a, then b, are followed by one of b (b / a^2) b.
+    share = FORESIGHT * limits.tolerance
+    foreseen = (before > 0) & (fall >= 0) & (fall * fall * fall <= (share * before) ** 2)
+    # The distance is foreseen as well as the foot where it is longer than the step.
+    foreseen &= fall <= first.f - fall
+    at_s, at_t = (free_u - box.centre_u) * box.rate_u, (free_v - box.centre_v) * box.rate_v
+    foreseen &= (next_u == free_u) & (next_v == free_v)
+    foreseen &= (jnp.abs(at_s) <= INSIDE) & (jnp.abs(at_t) <= INSIDE)
+    return next_u, next_v, jnp.maximum(first.f - fall, 0.0), foreseen
 
 
 def _downhill(
@@ -194,27 +244,28 @@ def _downhill(
     dt: Array,
     pinned_s: Array,
     pinned_t: Array,
+    settled: Array,
     box: Box,
 ) -> tuple[Array, Array]:
-    """The step, no longer than LONGEST_STEP, or half the scaled gradient where it leads uphill.
+    """The step, no coordinate longer than LONGEST_STEP, or half the scaled gradient where it leads uphill.
 
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.
     """
-    tiny = jnp.finfo(u.dtype).tiny
-    longest = jnp.maximum(jnp.abs(ds), jnp.abs(dt))
-    shorter = jnp.minimum(1.0, LONGEST_STEP / jnp.maximum(longest, 1.0))
-    ds, dt = _within(box, u, v, shorter * ds, shorter * dt)
+    ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)
+    ds, dt = _within(box, u, v, ds, dt)
     uphill = first.gradient_s * ds + first.gradient_t * dt <= 0
+    tiny = jnp.finfo(u.dtype).tiny
     slope_s = jnp.where(pinned_s, 0.0, 0.5 * first.gradient_s / jnp.maximum(first.E, tiny))
     slope_t = jnp.where(pinned_t, 0.0, 0.5 * first.gradient_t / jnp.maximum(first.G, tiny))
     slope_s, slope_t = _within(box, u, v, slope_s, slope_t)
-    return jnp.where(uphill, slope_s, ds), jnp.where(uphill, slope_t, dt)
+    ds, dt = jnp.where(uphill, slope_s, ds), jnp.where(uphill, slope_t, dt)
+    return jnp.where(settled, 0.0, ds), jnp.where(settled, 0.0, dt)
 
 
 def _within(box: Box, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
     """A step in local coordinates, cut off at the bounds."""
-    low_s, high_s = (box.low_u - u) / box.half_u, (box.high_u - u) / box.half_u
-    low_t, high_t = (box.low_v - v) / box.half_v, (box.high_v - v) / box.half_v
+    low_s, high_s = (box.low_u - u) * box.rate_u, (box.high_u - u) * box.rate_u
+    low_t, high_t = (box.low_v - v) * box.rate_v, (box.high_v - v) * box.rate_v
     return jnp.clip(ds, low_s, high_s), jnp.clip(dt, low_t, high_t)
 
 
@@ -234,6 +285,6 @@ def _pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple
     return pinned_s, pinned_t, settled_s & settled_t
 
 
-def keep(which: Array, old: Feet, new: Feet) -> Feet:
+def keep(which: Bool[Array, "*shape"], old: Feet, new: Feet) -> Feet:
     """`old` where `which`, `new` elsewhere."""
     return Feet(jnp.where(which[None], old.real, new.real), jnp.where(which[None], old.whole, new.whole))

@@ -1,18 +1,16 @@
 """From starting parameters to converged feet: the kernel every closest point and every fit calls."""
 
+import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._closest._blocks import finish
-from jaxfit._closest._feet import Feet, new_feet
+from jaxfit._closest._feet import ARRIVED, GIVEN_UP, Feet, Limits, keep, new_feet
+from jaxfit._closest._passes import Border, settle
 from jaxfit._closest._steps import AbstractFootMethod
-from jaxfit._closest._sweep import sweep
 from jaxfit._splines._pieces import Pieces
 
-# Below this many points, or points per cell, rows are too empty to pay.
-ROWS_FROM_POINTS = 4096
-ROWS_FROM_FILL = 2
+EVERYWHERE, AGAIN = 0, 5  # stages; those between are the four borders
 
 
 def project(
@@ -27,20 +25,70 @@ def project(
     borders: bool = True,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, feet that do not converge are looked for on the four border curves.
+    they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
+    of the paper).
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
     """
-    points = target.shape[1]
+    pieces = jax.tree.map(jnp.asarray, pieces)
     noise = 4.0 * jnp.finfo(target.dtype).eps * jnp.max(jnp.abs(target))
     tolerance = jnp.maximum(jnp.asarray(tolerance, target.dtype), 4.0 * noise)
+    limits = Limits(tolerance, noise, jnp.asarray(max_steps, jnp.int32))
     axes = (pieces.axis_u, pieces.axis_v)
     u, v = (jnp.clip(x, a.breaks[0], a.breaks[-1]) for x, a in zip((u, v), axes, strict=True))
-    idle = jnp.zeros(points, bool) if idle is None else idle
-    if points >= ROWS_FROM_POINTS and points >= ROWS_FROM_FILL * pieces.cells:
-        feet = sweep(method, pieces, target, u, v, idle, tolerance, noise)
-    else:
-        feet = new_feet(u, v)
-    feet = feet.marked(feet.done | idle, feet.converged | idle)
-    return finish(method, pieces, target, feet, tolerance, noise, max_steps, borders)
+    feet = new_feet(u, v)
+    if idle is not None:
+        feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
+    if not borders:
+        return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
+    return _in_stages(method, pieces, target, feet, limits)
+
+
+def _in_stages(
+    method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits
+) -> Feet:
+    """Stages: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
+    from the nearest of what was found, so that "converged" always means: with respect to the whole surface.
+    """
+
+    def unsettled(carry: tuple[Array, Feet]) -> Array:
+        number, feet = carry
+        return (number <= AGAIN) & jnp.any(~feet.converged)
+
+    def stage(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
+        number, old = carry
+        border = _border(pieces, number)
+        budget = Limits(limits.tolerance, limits.noise, (number + 1) * limits.steps)
+        new = settle(method, pieces, target, _begin(old, number, border), border, budget)
+        return number + 1, _merge(old, new, number, limits)
+
+    return lax.while_loop(unsettled, stage, (jnp.asarray(EVERYWHERE, jnp.int32), feet))[1]
+
+
+def _border(pieces: Pieces, number: Array) -> Border:
+    """Bounds (low_u, high_u, low_v, high_v) of a stage: the domain, or one of its sides."""
+    bounds = []
+    for axis, low_side in ((pieces.axis_u, 1), (pieces.axis_v, 3)):
+        first, last = axis.breaks[0], axis.breaks[-1]
+        bounds.append(jnp.where(number == low_side + 1, last, first))
+        bounds.append(jnp.where(number == low_side, first, last))
+    return bounds[0], bounds[1], bounds[2], bounds[3]
+
+
+def _begin(old: Feet, number: Array, border: Border) -> Feet:
+    """The feet a stage works on; after the first, those not converged, afresh from their best."""
+    low_u, high_u, low_v, high_v = border
+    fresh = new_feet(jnp.clip(old.best_u, low_u, high_u), jnp.clip(old.best_v, low_v, high_v))
+    fresh = Feet(fresh.real, jnp.stack([fresh.halvings, old.steps, fresh.state]))
+    return keep(old.converged | (number == EVERYWHERE), old, fresh)
+
+
+def _merge(old: Feet, new: Feet, number: Array, limits: Limits) -> Feet:
+    """What a stage found; on a border only what is nearer, which has not converged by that."""
+    nearer = new.best < old.best - limits.slack(old.best)
+    nearer = jnp.where(jnp.isinf(old.best), jnp.isfinite(new.best), nearer)
+    whole = (number == EVERYWHERE) | (number == AGAIN)
+    state = jnp.where(new.converged & whole, ARRIVED, GIVEN_UP)
+    spent = Feet(old.real, new.whole).standing(jnp.full_like(state, GIVEN_UP))
+    return keep(old.converged, old, keep(nearer | whole, new.standing(state), spent))

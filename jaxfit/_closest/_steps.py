@@ -6,13 +6,13 @@ coordinates of a cell; both steps are invariant under a linear change of paramet
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractClassVar
 from jax import Array
+from jaxtyping import Float
 
 from jaxfit._cells import Jet
 
@@ -22,9 +22,10 @@ LEAST_EIGENVALUE = 1e-3
 TRUSTED_SHARE = 0.5
 
 
-def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """Inner product of two vectors given as lists of coordinates."""
-    return sum((x * y for x, y in zip(a[1:], b[1:], strict=True)), a[0] * b[0])
+def dot(a: Float[Array, "d ..."], b: Float[Array, "d ..."]) -> Float[Array, "..."]:
+    """Inner product along the first axis; written out, for a reduction is not fused with what follows."""
+    products = [x * y for x, y in zip(a, b, strict=True)]
+    return sum(products[1:], products[0])
 
 
 class Forms(eqx.Module):
@@ -42,7 +43,7 @@ class Forms(eqx.Module):
     drift: tuple[Array, ...] | None = None  # second times first derivatives, where a method asks
 
 
-def measure(e: Sequence[Array], jet: Jet, drift: bool) -> Forms:
+def measure(e: Float[Array, "d ..."], jet: Jet, drift: bool) -> Forms:
     """All inner products from the residual and the derivatives."""
     seconds = (jet.ss, jet.st, jet.tt)
     sideways = tuple(dot(x, y) for x in seconds for y in (jet.s, jet.t)) if drift else None
@@ -90,10 +91,11 @@ class Newton(AbstractFootMethod):
         lowest = _divide(trace - root, 2.0 * metric)
         doubtful = lowest < _tiny_angle(E) ** 0.5
         lift = jnp.where(doubtful, jnp.abs(lowest) - lowest + LEAST_EIGENVALUE, 0.0)
-        both = _solve(first, a + lift * E, b + lift * F, c + lift * G)
-        along_s = _divide(first.gradient_s, jnp.maximum(jnp.abs(a), LEAST_EIGENVALUE * E))
-        along_t = _divide(first.gradient_t, jnp.maximum(jnp.abs(c), LEAST_EIGENVALUE * G))
-        return _choose(both, along_s, along_t, pinned_s, pinned_t)
+        single_a = jnp.maximum(jnp.abs(a), LEAST_EIGENVALUE * E)
+        single_c = jnp.maximum(jnp.abs(c), LEAST_EIGENVALUE * G)
+        a = jnp.where(pinned_t, single_a, a + lift * E)
+        c = jnp.where(pinned_s, single_c, c + lift * G)
+        return _solve(first, a, b + lift * F, c, pinned_s, pinned_t)
 
 
 class HuWallner(AbstractFootMethod):
@@ -110,10 +112,7 @@ class HuWallner(AbstractFootMethod):
 
     def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""
-        flat = _solve(first, first.E, first.F, first.G)
-        along_s = _divide(first.gradient_s, first.E)
-        along_t = _divide(first.gradient_t, first.G)
-        ds, dt = _choose(flat, along_s, along_t, pinned_s, pinned_t)
+        ds, dt = _solve(first, first.E, first.F, first.G, pinned_s, pinned_t)
         ss, st, tt = ds * ds, 2.0 * ds * dt, dt * dt  # second derivative along (ds, dt)
         length2 = ss * first.E + st * first.F + tt * first.G
         height2 = first.f - 2.0 * (ds * first.gradient_s + dt * first.gradient_t) + length2
@@ -134,20 +133,19 @@ class HuWallner(AbstractFootMethod):
         return jnp.where(trusted, factor * ds, newton_s), jnp.where(trusted, factor * dt, newton_t)
 
 
-def _choose(both, along_s: Array, along_t: Array, pinned_s: Array, pinned_t: Array):
-    """The coupled step, or the one along the free coordinate where the other is pinned."""
-    zero = jnp.zeros_like(along_s)
-    ds = jnp.where(pinned_s, zero, jnp.where(pinned_t, along_s, both[0]))
-    dt = jnp.where(pinned_t, zero, jnp.where(pinned_s, along_t, both[1]))
-    return ds, dt
+def _solve(
+    first: Forms, a: Array, b: Array, c: Array, pinned_s: Array, pinned_t: Array
+) -> tuple[Array, Array]:
+    """Solve [[a, b], [b, c]] step = gradient for the free coordinates; the others do not move.
 
-
-def _solve(first: Forms, a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """Solve [[a, b], [b, c]] step = gradient; along the axes where the tangents are parallel."""
+    Where the tangents are parallel, along the axes. As few divisions as can be, for they take the time.
+    """
+    gs = jnp.where(pinned_s, 0.0, first.gradient_s)
+    gt = jnp.where(pinned_t, 0.0, first.gradient_t)
+    b = jnp.where(pinned_s | pinned_t, 0.0, b)
     determinant = a * c - b * b
     regular = determinant > _tiny_angle(a) * first.E * first.G
     inverse = 1.0 / jnp.where(regular, determinant, 1.0)
-    gs, gt = first.gradient_s, first.gradient_t
     ds = jnp.where(regular, (c * gs - b * gt) * inverse, 0.5 * _divide(gs, first.E))
     dt = jnp.where(regular, (a * gt - b * gs) * inverse, 0.5 * _divide(gt, first.G))
     return ds, dt

@@ -17,7 +17,7 @@ from jaxfit._cells import (
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._loop import AbstractIterativeMethod, Measured
 from jaxfit._fit._measure import border, measure_feet
-from jaxfit._splines._pieces import Pieces, span_polynomials
+from jaxfit._splines._pieces import Pieces
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -61,13 +61,11 @@ class GeometricApproximation(AbstractIterativeMethod):
             s, t = local_coordinates(pieces, rows.cell[:, None], u, v)
             on_surface = evaluate_values(row_coefficients(pieces, rows), s, t)
             weight = jnp.where(rows.filled, weight, 0.0)
-            error = [q - x for q, x in zip(rows.spread(problem.target), on_surface, strict=True)]
-            return s, t, jnp.stack([weight * e for e in error] + [weight])
+            error = rows.spread(problem.target) - on_surface
+            return s, t, jnp.concatenate([weight[None] * error, weight[None]])
 
         s, t, values = staged(problem.diagonal > 0, errors_in_rows)
-        poly_u = span_polynomials(problem.knots_u, problem.knots_u.shape[0] - net.shape[0])
-        poly_v = span_polynomials(problem.knots_v, problem.knots_v.shape[0] - net.shape[1])
-        sums = net_sums(rows, s, t, values, poly_u, poly_v)
+        sums = net_sums(rows, s, t, values, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
         weight = sums[..., -1:]
         touched = weight > 0
         shift = jnp.where(touched, sums[..., :-1] / jnp.where(touched, weight, 1.0), 0.0)

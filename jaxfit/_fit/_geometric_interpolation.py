@@ -52,9 +52,6 @@ class GeometricInterpolation(AbstractIterativeMethod):
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Closest points from the last ones."""
-        nu, nv = (
-            knots.shape[0] - k
-            for knots, k in zip((problem.knots_u, problem.knots_v), pieces.order, strict=True)
-        )
+        nu, nv = (x.cells + k - 1 for x, k in zip((pieces.axis_u, pieces.axis_v), pieces.order, strict=True))
         corners = border(nu, nv, corners_only=True).reshape(-1)
         return measure_feet(self.foot_method, problem, pieces, measured, corners, borders=True)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxfit._closest import globally, prepare
+from jaxfit._closest import globally, padded, prepare
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, advance, begin
 from jaxfit._fit._problem import Problem
 
@@ -22,30 +22,27 @@ def global_feet(
     method: AbstractIterativeMethod, problem: Problem, net: Array, count: int, max_steps: int
 ) -> Feet:
     """(u, v, distance, found) of the first `count` points, in the problem's unit."""
-    prepared = prepare(net, problem.knots_u, problem.knots_v, sampled=True)
-    points = np.asarray(problem.target).T
-    size = points.shape[0]
+    prepared = prepare(net, problem.axis_u, problem.axis_v, sampled=True)
+    size = problem.target.shape[1]
+    points = np.asarray(problem.target)[:, :count]
     dtype = problem.target.dtype
     nothing = jnp.asarray(0, jnp.int32)
     limits = Limits(jnp.asarray(-1.0, dtype), jnp.asarray(-1.0, dtype), nothing)
 
     def feet_from(which: Any, u: Any, v: Any) -> dict[str, np.ndarray]:
-        chosen = points[:count][which]
-        filling = size - len(chosen)
-
-        def padded(x: Any) -> np.ndarray:
-            return np.concatenate([x, np.repeat(x[-1:], filling, axis=0)])
-
-        real = jnp.asarray((np.arange(size) < len(chosen)).astype(dtype))
-        target = jnp.asarray(np.ascontiguousarray(padded(chosen).T))
+        chosen = points if which is None else points[:, which]
+        real = jnp.asarray((np.arange(size) < chosen.shape[1]).astype(dtype))
+        inputs = (jnp.asarray(padded(np.asarray(x), size).astype(dtype)) for x in (chosen, u, v))
+        target, start_u, start_v = inputs
         mine = eqx.tree_at(lambda p: (p.target, p.weight, p.padding), problem, (target, real, real))
-        start_u, start_v = (jnp.asarray(padded(np.asarray(x)).astype(dtype)) for x in (u, v))
         first = begin(net, start_u, start_v, max_steps)
         carry = advance(method, mine, limits, nothing, first)
         m = carry.measured
-        fields = dict(u=m.u, v=m.v, f=m.error**2, ok=m.found, n=m.steps)
-        return {name: np.array(x)[: len(chosen)] for name, x in fields.items()}
+        fields = dict(u=m.u, v=m.v, error=m.error, converged=m.found, steps=m.steps)
+        feet = {name: np.asarray(x)[: chosen.shape[1]] for name, x in fields.items()}
+        feet["f"] = feet.pop("error") ** 2
+        return feet
 
-    centred = points[:count].astype(np.float64) - np.asarray(prepared.centre, np.float64)
+    centred = points.T.astype(np.float64) - prepared.centre[None, :]
     best = globally(feet_from, prepared.samples, centred, size)
-    return best["u"], best["v"], np.sqrt(best["f"]), best["ok"]
+    return best["u"], best["v"], np.sqrt(best["f"]), best["converged"]

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit._checks import is_concrete
 from jaxfit._fit._results import RESULTS
 from jaxfit._precision import bucket
-from jaxfit._splines._pieces import Pieces, make_pieces
+from jaxfit._splines._pieces import Pieces, pieces_on
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
@@ -106,7 +106,7 @@ def advance(
 
     def body(carry: Carry) -> Carry:
         net = carry.following
-        pieces = make_pieces(net, problem.knots_u, problem.knots_v)
+        pieces = pieces_on(net, problem.axis_u, problem.axis_v)
         measured = method.measure(problem, pieces, carry.measured)
         average, maximum = problem.summarise(measured.error)
         following = method.move(problem, net, pieces, measured)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxfit._checks import is_concrete
 from jaxfit._precision import bucket, working_dtype
 from jaxfit._splines import BSplineSurface
+from jaxfit._splines._pieces import Axis, make_axis
 
 
 class Problem(eqx.Module):
@@ -18,8 +19,8 @@ class Problem(eqx.Module):
 
     target: Float[Array, "d points"]
     weight: Float[Array, " points"]
-    knots_u: Float[Array, " knots_u"]
-    knots_v: Float[Array, " knots_v"]
+    axis_u: Axis
+    axis_v: Axis
     padding: Float[Array, " points"]  # 1 for a point, 0 for what only fills up the size
     diagonal: Float[Array, ""]
     foot_tolerance: Float[Array, ""]
@@ -96,8 +97,8 @@ def make_problem(
     return Problem(
         target=jnp.asarray(inner.T, dtype),
         weight=jnp.asarray(weight, dtype),
-        knots_u=jnp.asarray(surface.knots_u, dtype),
-        knots_v=jnp.asarray(surface.knots_v, dtype),
+        axis_u=make_axis(surface.knots_u.astype(dtype), surface.order[0]),
+        axis_v=make_axis(surface.knots_v.astype(dtype), surface.order[1]),
         padding=jnp.asarray(real, dtype),
         diagonal=jnp.asarray(unit.diagonal / unit.scale, dtype),
         foot_tolerance=jnp.asarray(foot_tolerance, dtype),

@@ -9,73 +9,96 @@ monomials of low degree are well conditioned, so little is lost against the recu
 same with a single cell and order 1 in v.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-FEW = 4096
+from jaxfit._checks import is_concrete
+
+Numbers = Array | np.ndarray
 
 
 class Axis(eqx.Module):
-    """One direction of the cells: break points, and the smooth stretches between creases.
+    """One direction of the cells: all that depends on the knots and not on the net.
 
-    A crease is a knot of multiplicity order - 1 or more, where the tangent may jump. `low` and `high`
-    bound the stretch without creases inside that a cell lies in; `first` and `last` are the cells at
-    the ends of that stretch. `ends` are the first and the last cell of positive width, `before` and
-    `after` the cells across the creases on either side (the cell itself at the ends of the domain).
+    A crease is a knot of multiplicity order - 1 or more, where the tangent may jump. `first` and `last` are
+    the cells at the ends of the smooth stretch, without creases inside, that a cell lies in; `before` and
+    `after` are the cells across the creases on either side (the cell itself at the ends of the domain).
+    `ends` are the first and the last cell of positive width. `bounds` holds, for every cell, both ends of
+    its stretch, its own middle and half its width (1 for an empty span, which no parameter falls into).
+    `polynomials` are the basis functions, `span_polynomials`.
+
+    Whether there are creases is known before tracing where the knots are.
     """
 
-    breaks: Float[Array, " breaks"]
-    low: Float[Array, " cells"]
-    high: Float[Array, " cells"]
-    first: Int[Array, " cells"]
-    last: Int[Array, " cells"]
-    ends: Int[Array, "2"]
-    before: Int[Array, " cells"]
-    after: Int[Array, " cells"]
+    breaks: Float[Numbers, " breaks"]
+    bounds: Float[Numbers, "4 cells"]
+    first: Int[Numbers, " cells"]
+    last: Int[Numbers, " cells"]
+    ends: Int[Numbers, "2"]
+    before: Int[Numbers, " cells"]
+    after: Int[Numbers, " cells"]
+    polynomials: Float[Numbers, "cells K K"]
+    creased: bool = eqx.field(static=True)
 
     @property
     def cells(self) -> int:
         """Number of knot spans, empty ones included (so that it depends on shapes only)."""
-        return self.low.shape[0]
+        return self.bounds.shape[1]
 
     @property
-    def centre(self) -> Float[Array, " cells"]:
+    def low(self) -> Float[Numbers, " cells"]:
+        """Lower end of every cell's stretch."""
+        return self.bounds[0]
+
+    @property
+    def high(self) -> Float[Numbers, " cells"]:
+        """Upper end of every cell's stretch."""
+        return self.bounds[1]
+
+    @property
+    def centre(self) -> Float[Numbers, " cells"]:
         """Middle of every span."""
-        return 0.5 * (self.breaks[1:] + self.breaks[:-1])
+        return self.bounds[2]
 
     @property
-    def half(self) -> Float[Array, " cells"]:
-        """Half the width of every span; 1 for an empty one, which no parameter falls into."""
-        width = self.breaks[1:] - self.breaks[:-1]
-        return jnp.where(width > 0, 0.5 * width, 1.0)
+    def half(self) -> Float[Numbers, " cells"]:
+        """Half the width of every span."""
+        return self.bounds[3]
 
-    def locate(self, u: Float[Array, "..."]) -> Int[Array, "..."]:
+    def locate(self, u: Any) -> Any:
         """Span with breaks[i] <= u < breaks[i+1]; the last non-empty one at the right end."""
-        if u.size <= FEW:  # comparing with all breaks is quick, and much quicker to compile
-            inner = jnp.sum(self.breaks.reshape((1,) * u.ndim + (-1,)) <= u[..., None], axis=-1) - 1
-        else:
-            inner = self._bisect(u)
+        if is_concrete(self, u):
+            inner = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
+            return np.clip(inner, *np.asarray(self.ends)).astype(np.int32)
+        inner = _last_not_above(jnp.asarray(self.breaks), jnp.asarray(u))
         return jnp.clip(inner, self.ends[0], self.ends[1]).astype(jnp.int32)
 
-    def _bisect(self, u: Float[Array, "..."]) -> Int[Array, "..."]:
-        # As jnp.searchsorted, without its care for NaN and signed zeros, which doubles the work.
-        found = jnp.zeros(u.shape, jnp.int32)
-        for bit in reversed(range(self.cells.bit_length())):
-            trial = found + (1 << bit)
-            inside = trial <= self.cells
-            passed = self.breaks[jnp.minimum(trial, self.cells)] <= u
-            found = jnp.where(inside & passed, trial, found)
-        return found
+
+def _last_not_above(breaks: Float[Array, " breaks"], u: Float[Array, "..."]) -> Int[Array, "..."]:
+    """The last i with breaks[i] <= u, by counting: every so many breaks, then those between.
+
+    Two short sums without memory between compile and run faster than bisection.
+    """
+    count = breaks.shape[0]
+    stride = max(1, math.isqrt(count))
+    column = (-1,) + (1,) * u.ndim
+    coarse = jnp.sum(breaks[::stride].reshape(column) <= u[None], axis=0, dtype=jnp.int32) - 1
+    first = jnp.maximum(coarse, 0) * stride
+    number = first[None] + jnp.arange(1, stride, dtype=jnp.int32).reshape(column)
+    passed = (breaks[jnp.minimum(number, count - 1)] <= u[None]) & (number < count)
+    return first + jnp.sum(passed, axis=0, dtype=jnp.int32)
 
 
 class Pieces(eqx.Module):
     """Polynomial pieces of a surface, `coefficients[cell_u * cells_v + cell_v, coordinate, a, b]`."""
 
-    coefficients: Float[Array, "cells d K L"]
+    coefficients: Float[Numbers, "cells d K L"]
     axis_u: Axis
     axis_v: Axis
 
@@ -90,74 +113,106 @@ class Pieces(eqx.Module):
         return self.coefficients.shape[2], self.coefficients.shape[3]
 
 
-def make_axis(knots: Float[Array, " knots"], order: int) -> Axis:
-    """The spans of a knot vector's domain, with the smooth stretches they belong to."""
+def make_axis(knots: Float[Numbers, " knots"], order: int) -> Axis:
+    """The spans of a knot vector's domain, with the smooth stretches they belong to.
+
+    Concrete knots are dealt with by NumPy, so that nothing compiles.
+    """
+    concrete = is_concrete(knots)
+    xp: Any = np if concrete else jnp
+    dtype, knots = knots.dtype, np.asarray(knots, np.float64) if concrete else knots
     breaks = knots[order - 1 : knots.shape[0] - order + 1]
     cells = breaks.shape[0] - 1
-    number = jnp.arange(cells, dtype=jnp.int32)
-    repeats = jnp.sum(breaks[:, None] == knots[None, :], axis=1)
-    crease = repeats >= max(order - 1, 1)
-    crease = crease.at[0].set(True).at[-1].set(True)
+    number, knot = xp.arange(cells), xp.arange(cells + 1)
+    repeats = xp.sum(breaks[:, None] == knots[None, :], axis=1)
+    at_end = (knot == 0) | (knot == cells)
+    crease = (repeats >= max(order - 1, 1)) | at_end
     filled = breaks[1:] > breaks[:-1]
     # The nearest crease to the left and to the right; empty spans neither start nor end a stretch.
-    first = lax.cummax(jnp.where(crease[:-1] & filled, number, 0))
-    last = lax.cummin(jnp.where(crease[1:] & filled, number, cells - 1), reverse=True)
-    ends = jnp.stack([jnp.argmax(filled), cells - 1 - jnp.argmax(filled[::-1])]).astype(jnp.int32)
+    first = _highest_so_far(xp.where(crease[:-1] & filled, number, 0))
+    last = _lowest_from_here(xp.where(crease[1:] & filled, number, cells - 1))
+    ends = xp.stack([xp.argmax(filled), cells - 1 - xp.argmax(filled[::-1])])
     # The filled cell on the other side of a crease; empty spans may lie between.
-    left = lax.cummax(jnp.where(filled, number, -1))[jnp.maximum(first - 1, 0)]
-    right = lax.cummin(jnp.where(filled, number, cells), reverse=True)
-    right = right[jnp.minimum(last + 1, cells - 1)]
-    before = jnp.where(first > ends[0], left, number)
-    after = jnp.where(last < ends[1], right, number)
-    return Axis(breaks, breaks[first], breaks[last + 1], first, last, ends, before, after)
+    left = _highest_so_far(xp.where(filled, number, -1))[xp.maximum(first - 1, 0)]
+    right = _lowest_from_here(xp.where(filled, number, cells))[xp.minimum(last + 1, cells - 1)]
+    before = xp.where(first > ends[0], left, number)
+    after = xp.where(last < ends[1], right, number)
+    centre, half = _middles(breaks)
+    bounds = xp.stack([breaks[first], breaks[last + 1], centre, half])
+    whole = [x.astype(np.int32) for x in (first, last, ends, before, after)]
+    real = [x.astype(dtype) for x in (breaks, bounds, span_polynomials(knots, order))]
+    creased = bool(np.any(crease & ~at_end)) if concrete else True
+    return Axis(real[0], real[1], *whole, real[2], creased)
 
 
-def span_polynomials(knots: Float[Array, " knots"], order: int) -> Float[Array, "spans K K"]:
+def _middles(breaks: Any) -> tuple[Any, Any]:
+    """Centre and half width of every span."""
+    xp: Any = np if is_concrete(breaks) else jnp
+    width = breaks[1:] - breaks[:-1]
+    return 0.5 * (breaks[1:] + breaks[:-1]), xp.where(width > 0, 0.5 * width, 1.0)
+
+
+def _highest_so_far(x: Any) -> Any:
+    return np.maximum.accumulate(x) if is_concrete(x) else lax.cummax(x)
+
+
+def _lowest_from_here(x: Any) -> Any:
+    return -_highest_so_far(-x[::-1])[::-1]
+
+
+def span_polynomials(knots: Float[Numbers, " knots"], order: int) -> Float[Numbers, "spans K K"]:
     """Non-zero basis functions of every span as polynomials, M[span, r, a] of s^a, s in [-1, 1].
 
     The Cox-de Boor recursion, (2)-(3) in the paper, carried out on coefficients: each of its factors
     is a polynomial of degree one in s. Empty spans give finite values that nothing uses.
     """
-    axis = make_axis(knots, order)
-    centre, half = axis.centre, axis.half
-    spans = axis.cells
+    xp: Any = np if is_concrete(knots) else jnp
+    centre, half = _middles(knots[order - 1 : knots.shape[0] - order + 1])
+    spans = centre.shape[0]
 
-    def knot(offset: int) -> Float[Array, " spans"]:
-        return lax.slice_in_dim(knots, order - 1 + offset, order - 1 + offset + spans)
+    def knot(offset: int) -> Any:
+        return knots[order - 1 + offset : order - 1 + offset + spans]
 
-    zero = jnp.zeros((spans, order), knots.dtype)
-    basis = [zero.at[:, 0].set(1.0)]
+    one = xp.ones((spans, 1), knots.dtype)
+    basis = [xp.concatenate([one, xp.zeros((spans, order - 1), knots.dtype)], axis=1)]
     for degree in range(1, order):
-        raised = [zero] * (degree + 1)
+        raised = [xp.zeros((spans, order), knots.dtype)] * (degree + 1)
         for r in range(degree):
             left, right = knot(r + 1 - degree), knot(r + 1)
             width = right - left
-            share = jnp.where(width > 0, 1.0, 0.0) / jnp.where(width > 0, width, 1.0)
+            share = xp.where(width > 0, 1.0, 0.0) / xp.where(width > 0, width, 1.0)
             scaled = basis[r] * share[:, None]
             raised[r] = raised[r] + _times_linear(scaled, right - centre, -half)
             raised[r + 1] = raised[r + 1] + _times_linear(scaled, centre - left, half)
         basis = raised
-    return jnp.stack(basis, axis=1)
+    return xp.stack(basis, axis=1)
 
 
-def _times_linear(
-    p: Float[Array, "spans K"], constant: Float[Array, " spans"], slope: Float[Array, " spans"]
-) -> Float[Array, "spans K"]:
+def _times_linear(p: Any, constant: Any, slope: Any) -> Any:
     """(constant + slope s) p(s), the highest coefficient of p being zero."""
-    shifted = jnp.concatenate([jnp.zeros_like(p[:, :1]), p[:, :-1]], axis=1)
+    xp: Any = np if is_concrete(p, constant, slope) else jnp
+    shifted = xp.concatenate([xp.zeros_like(p[:, :1]), p[:, :-1]], axis=1)
     return constant[:, None] * p + slope[:, None] * shifted
 
 
 def make_pieces(
-    control_points: Float[Array, "nu nv d"],
-    knots_u: Float[Array, " knots_u"],
-    knots_v: Float[Array, " knots_v"],
+    control_points: Float[Numbers, "nu nv d"],
+    knots_u: Float[Numbers, " knots_u"],
+    knots_v: Float[Numbers, " knots_v"],
 ) -> Pieces:
     """All polynomial pieces of a surface; the orders follow from the shapes."""
-    nu, nv, d = control_points.shape
-    order_u, order_v = knots_u.shape[0] - nu, knots_v.shape[0] - nv
-    poly_u, poly_v = span_polynomials(knots_u, order_u), span_polynomials(knots_v, order_v)
-    cells_u, cells_v = nu - order_u + 1, nv - order_v + 1
+    nu, nv, _ = control_points.shape
+    axes = make_axis(knots_u, knots_u.shape[0] - nu), make_axis(knots_v, knots_v.shape[0] - nv)
+    return pieces_on(control_points, *axes)
+
+
+def pieces_on(control_points: Float[Numbers, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Pieces:
+    """The pieces of a surface, its knots having been dealt with before."""
+    concrete = is_concrete(control_points, axis_u, axis_v)
+    poly_u, poly_v = axis_u.polynomials, axis_v.polynomials
+    if concrete:
+        poly_u, poly_v, control_points = (np.asarray(x) for x in (poly_u, poly_v, control_points))
+    (cells_u, order_u, _), (cells_v, order_v, _) = poly_u.shape, poly_v.shape
     # One direction at a time, as sums of shifted slices: no gather, and XLA fuses the lot.
     rows: Any = sum(
         poly_u[:, r, :, None, None] * control_points[r : r + cells_u, None] for r in range(order_u)
@@ -166,8 +221,8 @@ def make_pieces(
         rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :] for r in range(order_v)
     )
     ordered = both.transpose(0, 2, 3, 1, 4)
-    coefficients = ordered.reshape(cells_u * cells_v, d, order_u, order_v)
-    return Pieces(coefficients, make_axis(knots_u, order_u), make_axis(knots_v, order_v))
+    coefficients = ordered.reshape(cells_u * cells_v, -1, order_u, order_v)
+    return Pieces(coefficients, axis_u, axis_v)
 
 
 def as_surface_arrays(spline: Any) -> tuple[Array, Array, Array]:

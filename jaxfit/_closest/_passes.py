@@ -1,0 +1,116 @@
+"""Feet moved on in passes: points laid out in rows of one cell, a block of rows at a time.
+
+A pass lays out the feet that are still going and takes a few steps with each, on the polynomial of the cell
+it is in. Feet change cells, so the next pass lays them out anew; the first holds nearly all points, the
+last ones a few stragglers.
+"""
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float
+
+from jaxfit._cells import Rows, make_rows, row_width
+from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
+from jaxfit._closest._feet import ARRIVED, Box, Feet, Limits, advance, is_going
+from jaxfit._closest._steps import AbstractFootMethod
+from jaxfit._splines._pieces import Axis, Pieces
+
+STEPS_PER_PASS = 4
+SLOTS_PER_BLOCK = 32768
+# Below this many points, or points per cell, rows of several points are too empty to pay.
+SHARED_FROM_POINTS = 4096
+SHARED_FROM_FILL = 2
+
+Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v
+
+
+def settle(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Float[Array, "d points"],
+    feet: Feet,
+    border: Border,
+    limits: Limits,
+) -> Feet:
+    """Passes until no foot is going."""
+    creased = pieces.axis_u.creased or pieces.axis_v.creased
+    home = at_home(pieces, feet) if creased else None
+
+    def unfinished(carry: tuple[Feet, Home | None]) -> Array:
+        return jnp.any(is_going(carry[0], limits))
+
+    def one(carry: tuple[Feet, Home | None]) -> tuple[Feet, Home | None]:
+        feet, home = carry
+        cell_u, cell_v = pieces.axis_u.locate(feet.u), pieces.axis_v.locate(feet.v)
+        if home is not None:
+            cell_u, cell_v = home_cells(pieces, home, cell_u, cell_v)
+        cell = cell_u * pieces.axis_v.cells + cell_v
+        rows = _rows(jnp.where(is_going(feet, limits), cell, pieces.cells), pieces.cells)
+        moved = _pass(method, pieces, target, feet, rows, border, limits)
+        return (moved, None) if home is None else cross_creases(pieces, feet, moved, home, limits)
+
+    return lax.while_loop(unfinished, one, (feet, home))[0]
+
+
+def _rows(cell: Array, cells: int) -> Rows:
+    points = cell.shape[0]
+    shared = points >= SHARED_FROM_POINTS and points >= SHARED_FROM_FILL * cells
+    return make_rows(cell, cells, row_width(points, cells) if shared else 1)
+
+
+def _pass(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Array,
+    feet: Feet,
+    rows: Rows,
+    border: Border,
+    limits: Limits,
+) -> Feet:
+    """A few steps for every foot in a row."""
+    count, width = rows.point.shape
+    size = min(count, max(1, SLOTS_PER_BLOCK // width))
+
+    def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
+        start, feet = carry
+        part = rows.block(start, size)
+        coefficients = jnp.moveaxis(pieces.coefficients[part.cell], 0, -1)[..., None]
+        box = _box(pieces, part.cell, border)
+        goal = part.spread(target)
+        mine = Feet(part.spread(feet.real), part.spread(feet.whole))
+        mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
+
+        def unfinished(carry: tuple[Array, Feet]) -> Array:
+            return (carry[0] < STEPS_PER_PASS) & jnp.any(is_going(carry[1], limits))
+
+        def step(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
+            return carry[0] + 1, advance(method, carry[1], goal, coefficients, box, limits)
+
+        mine = lax.while_loop(unfinished, step, (jnp.asarray(0, jnp.int32), mine))[1]
+        real = feet.real.at[:, part.point].set(mine.real, mode="drop")
+        whole = feet.whole.at[:, part.point].set(mine.whole, mode="drop")
+        return start + size, Feet(real, whole)
+
+    return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), feet))[1]
+
+
+def _box(pieces: Pieces, cell: Array, border: Border) -> Box:
+    """Bounds and local coordinates of cells given by number, with a last axis to broadcast along."""
+    low_u, high_u, centre_u, half_u = _bounds(pieces.axis_u, cell // pieces.axis_v.cells)
+    low_v, high_v, centre_v, half_v = _bounds(pieces.axis_v, cell % pieces.axis_v.cells)
+    return Box(
+        jnp.maximum(low_u, border[0]),
+        jnp.minimum(high_u, border[1]),
+        jnp.maximum(low_v, border[2]),
+        jnp.minimum(high_v, border[3]),
+        centre_u,
+        half_u,
+        1.0 / half_u,
+        centre_v,
+        half_v,
+        1.0 / half_v,
+    )
+
+
+def _bounds(axis: Axis, cell: Array) -> list[Array]:
+    return [x[:, None] for x in axis.bounds[:, cell]]

@@ -1,0 +1,158 @@
+"""The search for rivals: every sample that could lead to a nearer foot than the one found, on the host.
+
+A foot at distance d can have a nearer rival elsewhere only if the sample next to the rival, at most half a
+spacing (a, b) away, is close enough: the residual e of the rival is orthogonal to the tangents (along a crease
+or border, to the one that matters, for samples lie on those), so the squared distance of that sample exceeds
+the rival's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components only. Every
+sample this close that is not beside a foot already found is a start.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._closest._seeds import Samples
+
+WIDER = 1.5  # how much slack may differ among samples equally far from a point
+BESIDE = 1.5  # samples
+NEIGHBOURS = (8, 24, 80, 200)  # as many as it takes
+LEAST_STARTS = 4  # tried although a sample beside them is nearer
+LEAF = 32  # samples; the tree's own default is slower here
+
+
+class Search:
+    """The samples around every point, and which of them are still to be tried."""
+
+    def __init__(self, samples: Samples, points: Float[np.ndarray, "points d"]):
+        from scipy.spatial import KDTree
+
+        cloud = np.asarray(samples.points, np.float64)
+        self.cloud = cloud.reshape(-1, cloud.shape[-1])
+        self.slack, self.sag = (np.ravel(x) for x in (samples.slack, samples.sag))
+        self.along_u = _Direction(samples.u, samples.stretch_u)
+        self.along_v = _Direction(samples.v, samples.stretch_v)
+        self.tree = KDTree(self.cloud, LEAF, balanced_tree=False, compact_nodes=False)
+        self.points = points
+        self.distance, self.index = self._query(slice(None), NEIGHBOURS[0])
+
+    def _query(self, which: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+        count = min(count, self.tree.n)
+        distance, index = self.tree.query(self.points[which], k=count, workers=-1)
+        return distance.reshape(-1, count), index.reshape(-1, count)
+
+    def nearest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of the nearest sample of every point."""
+        return self.parameters(self.index[:, 0])
+
+    def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters of samples given by number."""
+        row, column = np.divmod(index, self.along_v.u.size)
+        return self.along_u.u[row], self.along_v.u[column]
+
+    def elsewhere(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Which samples, a row of them for each foot (u, v), do not lie beside it."""
+        row, column = np.divmod(sample, self.along_v.u.size)
+        return self.along_u.apart(row, u) | self.along_v.apart(column, v)
+
+    def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
+        """The samples that may lead to a foot nearer than those at (u, v)."""
+        which = np.arange(len(distance))
+        near, index = self.distance, self.index
+        who, sample = [], []
+        steps: tuple[Any, ...] = (*NEIGHBOURS[1:], None)
+        for more in steps:
+            crowded = np.zeros(len(which), bool)
+            if near.shape[1] < self.tree.n and more is not None:
+                crowded = self._is_crowded(near[:, -1], index, distance[which])
+            row, column = np.nonzero(self.elsewhere(index, u[which], v[which]) & ~crowded[:, None])
+            there, reach = index[row, column], distance[which[row]]
+            open_ = near[row, column] ** 2 <= reach**2 + self.slack[there] + reach * self.sag[there]
+            who.append(which[row[open_]])
+            sample.append(there[open_])
+            which = which[crowded]
+            if not which.size:
+                break
+            near, index = self._query(which, more)
+        return Rivals(self, np.concatenate(who), np.concatenate(sample))
+
+    def _is_crowded(self, last: np.ndarray, index: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Where samples farther than the last may matter, having at most WIDER times the slack of these."""
+        crowded = last**2 <= reach**2 + self.slack.max() + reach * self.sag.max()
+        few = np.flatnonzero(crowded)
+        wide, sag = (WIDER * x[index[few].T].max(axis=0) for x in (self.slack, self.sag))
+        crowded[few] = last[few] ** 2 <= reach[few] ** 2 + wide + reach[few] * sag
+        return crowded
+
+    def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
+        """Whether none of the eight samples around `sample` is nearer to the point `who`.
+
+        Only samples of the same smooth stretch count: a valley may end at a crease.
+        """
+        a, b = self.along_u.u.size, self.along_v.u.size
+        row, column = np.divmod(sample, b)
+        here = np.sum((self.cloud[sample] - self.points[who]) ** 2, axis=1)
+        low = np.ones(len(who), bool)
+        for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
+            next_row, next_column = np.clip(row + i, 0, a - 1), np.clip(column + j, 0, b - 1)
+            beside = self.cloud[next_row * b + next_column]
+            apart = self.along_u.stretch[next_row] != self.along_u.stretch[row]
+            apart |= self.along_v.stretch[next_column] != self.along_v.stretch[column]
+            low &= apart | (here <= np.sum((beside - self.points[who]) ** 2, axis=1))
+        return low
+
+
+class _Direction:
+    """Samples along one parameter."""
+
+    def __init__(self, u: Any, stretch: Any):
+        self.u, self.stretch = np.asarray(u), np.asarray(stretch)
+        self.smooth = bool((self.stretch == self.stretch[0]).all())
+
+    def apart(self, number: np.ndarray, foot: np.ndarray) -> np.ndarray:
+        """Whether samples are more than BESIDE away from a foot, or in another stretch.
+
+        Across a crease there may be another foot, however close.
+        """
+        at = np.interp(foot, self.u, np.arange(self.u.size))
+        shape = (-1,) + (1,) * (number.ndim - 1)
+        # Whole numbers from low to high lie beside the foot.
+        low, high = np.ceil(at - BESIDE).astype(int), np.floor(at + BESIDE).astype(int)
+        apart = (number < low.reshape(shape)) | (number > high.reshape(shape))
+        if not self.smooth:
+            apart |= self.stretch[number] != self.stretch[at.astype(int)].reshape(shape)
+        return apart
+
+
+class Rivals:
+    """Pairs (point, sample) still to be tried, grouped by point, the most promising first."""
+
+    def __init__(self, search: Search, who: np.ndarray, sample: np.ndarray):
+        self.search, self.who, self.sample = search, who, sample
+        # Valleys of the samples first, and of the rest, which should lead to the same feet, only a few.
+        flank = ~search.is_valley(self.who, self.sample)
+        order = np.lexsort((flank, self.who))
+        self._keep(order)
+        flank = flank[order]
+        before = np.cumsum(flank) - flank
+        first = np.searchsorted(self.who, self.who)
+        self._keep(~flank | (before - before[first] < LEAST_STARTS))
+
+    def _keep(self, which: np.ndarray) -> None:
+        self.who, self.sample = self.who[which], self.sample[which]
+
+    def found(self, u: np.ndarray, v: np.ndarray) -> None:
+        """Drop the samples beside the feet at (u, v), which are given for all points."""
+        self._keep(self.search.elsewhere(self.sample, u[self.who], v[self.who]))
+
+    def first(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """One start for each point that has any, taken off the list."""
+        first = np.ones(len(self.who), bool)
+        first[1:] = self.who[1:] != self.who[:-1]
+        who, sample = self.who[first], self.sample[first]
+        self._keep(~first)
+        return who, *self.search.parameters(sample)
+
+    def rest(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All starts that are left."""
+        return self.who, *self.search.parameters(self.sample)
