@@ -142,9 +142,12 @@ def _solve(
     """
     gs = jnp.where(pinned_s, 0.0, first.gradient_s)
     gt = jnp.where(pinned_t, 0.0, first.gradient_t)
-    b = jnp.where(pinned_s | pinned_t, 0.0, b)
+    # A pinned coordinate's own equation becomes that of the identity.
+    a, c = jnp.where(pinned_s, 1.0, a), jnp.where(pinned_t, 1.0, c)
+    alone = pinned_s | pinned_t
+    b = jnp.where(alone, 0.0, b)
     determinant = a * c - b * b
-    regular = determinant > _tiny_angle(a) * first.E * first.G
+    regular = determinant > jnp.where(alone, 0.0, _tiny_angle(a) * first.E * first.G)
     inverse = 1.0 / jnp.where(regular, determinant, 1.0)
     ds = jnp.where(regular, (c * gs - b * gt) * inverse, 0.5 * _divide(gs, first.E))
     dt = jnp.where(regular, (a * gt - b * gs) * inverse, 0.5 * _divide(gt, first.G))
