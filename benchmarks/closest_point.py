@@ -24,10 +24,11 @@ import helpers
 
 from jaxfit import BSplineSurface, HuWallner, Newton, closest_point
 from jaxfit._base import Boundary, base_surface
+from jaxfit._cells import values_at
 from jaxfit._closest import prepare
 from jaxfit._closest._project import project
 from jaxfit._closest._rivals import Search
-from jaxfit._splines._pieces import as_surface_arrays
+from jaxfit._splines._pieces import as_surface_arrays, make_axis
 
 BASES = {"blade_wrap_3000": (24, 40), "mannequin_head": (42, 42)}
 
@@ -92,14 +93,15 @@ def wavy(count, runs):
 def split(surface, points, start, runs):
     """The stages of the two calls, one by one (they do not add up exactly)."""
     count = len(points)
-    arrays = as_surface_arrays(surface)
+    net, *knots = as_surface_arrays(surface)
+    axes = [make_axis(x, order) for x, order in zip(knots, surface.order, strict=True)]
     for sampled in (False, True):
-        *times, prepared = timed(lambda s=sampled: prepare(*arrays, sampled=s), runs)
+        *times, prepared = timed(lambda s=sampled: prepare(net, *axes, sampled=s), runs)
         line(f"  prepare{', sampled' * sampled}", count, *times)
     centred = points - np.asarray(prepared.centre)
     target = jax.numpy.asarray(centred.T)
     begin = tuple(jax.device_put(x) for x in start)
-    tolerance = jax.numpy.asarray(1e-12 * extent(arrays[0], points))
+    tolerance = jax.numpy.asarray(1e-12 * helpers.diagonal(net))
     kernel = jax.jit(lambda q, u, v: project(Newton(), prepared.pieces, q, u, v, tolerance, np.int32(60)))
     *times, feet = timed(lambda: kernel(target, *begin), runs)
     line("  projection, warm", count, *times, f"{float(feet.steps.mean()):.1f} steps on average")
@@ -112,9 +114,9 @@ def split(surface, points, start, runs):
     *times, rivals = timed(lambda: search.rivals(*at), runs)
     note = f"{len(rivals.who)} starts for {len(np.unique(rivals.who))} points"
     line("  rivals: finding them", count, *times, note)
-    done = (prepared.pieces, feet.best_u, feet.best_v, feet.converged)
-    *times, _ = timed(lambda: _describe(*done), runs)
-    line("  describe", count, *times)
+    evaluate = jax.jit(values_at)
+    *times, _ = timed(lambda: evaluate(prepared.pieces, feet.best_u, feet.best_v), runs)
+    line("  points on the surface", count, *times)
     *times, _ = timed(lambda: [np.array(x) for x in jax.tree.leaves(feet)], runs)
     line("  transfer of the result", count, *times)
     *times, _ = timed(lambda: jax.numpy.asarray(np.asarray(points - centred[0]).T), runs)

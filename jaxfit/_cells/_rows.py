@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int, Shaped
 
+
 class Rows(eqx.Module):
     """Where every point sits: `point[row, slot]` is its number, or `points` for an empty slot.
 

@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._cells._rows import Rows
+from jaxfit._splines._pieces import Numbers
 
 
 def net_sums(
@@ -23,8 +24,8 @@ def net_sums(
     s: Float[Array, "rows width"],
     t: Float[Array, "rows width"],
     values: Float[Array, "c rows width"],
-    poly_u: Float[Array, "spans_u K K"],
-    poly_v: Float[Array, "spans_v L L"],
+    poly_u: Float[Numbers, "spans_u K K"],
+    poly_v: Float[Numbers, "spans_v L L"],
 ) -> Float[Array, "nu nv c"]:
     """sum_k N_i(u_k) N_j(v_k) values_k for every control point, empty slots having values 0.
 
@@ -53,8 +54,8 @@ def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order ro
 
 def _cells_to_net(
     moments: Float[Array, "cells K L c"],
-    poly_u: Float[Array, "spans_u K K"],
-    poly_v: Float[Array, "spans_v L L"],
+    poly_u: Float[Numbers, "spans_u K K"],
+    poly_v: Float[Numbers, "spans_v L L"],
 ) -> Float[Array, "nu nv c"]:
     """One direction at a time: moments into sums for the basis functions of a span, then spans overlapped."""
     (spans_u, order_u, _), (spans_v, order_v, _) = poly_u.shape, poly_v.shape

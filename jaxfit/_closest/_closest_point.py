@@ -178,7 +178,7 @@ def _on_host(
     axes = make_axis(knots_u, orders[0]), make_axis(knots_v, orders[1])
     best = feet_on_host(method, net, *axes, np.asarray(points), start, tolerance, max_steps)
     u, v, f, converged = (best[name] for name in ("u", "v", "f", "converged"))
-    status = _status(*(axis.breaks for axis in axes), u, v, converged, curve=orders[1] == 1)
+    status = _status(axes[0].breaks, axes[1].breaks, u, v, converged, orders[1] == 1)
     with np.errstate(invalid="ignore"):
         distance = np.sqrt(f)
     # Not jnp.asarray, which compiles a copy for every new size.

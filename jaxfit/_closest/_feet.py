@@ -13,9 +13,10 @@ from jaxfit._cells import evaluate_jet, staged
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 MOST_HALVINGS = 40
-LONGEST_STEP = 4.0  # in local coordinates: two cells
+LONGEST_STEP = 2.0  # in local coordinates: a cell
 # In units of a cell's half width: where its polynomial is the surface, and where it still leads on.
 INSIDE, NEAR = 1.0 + 1e-6, 2.0
+LED_ON = 8  # evaluations; a foot that takes longer may be going round in circles across a knot
 # The error foreseen after a step may be this share of the tolerance, for the foot to count as found.
 FORESIGHT = 0.1
 
@@ -34,7 +35,14 @@ class Feet(eqx.Module):
 
     @staticmethod
     def of(
-        u: Array, v: Array, best_u: Array, best_v: Array, best: Array, halvings: Array, steps: Array, state: Array
+        u: Array,
+        v: Array,
+        best_u: Array,
+        best_v: Array,
+        best: Array,
+        halvings: Array,
+        steps: Array,
+        state: Array,
     ) -> "Feet":
         """Stack the parts."""
         numbers = [x.astype(jnp.int32) for x in (halvings, steps, state)]
@@ -155,7 +163,7 @@ def advance(
     off = jnp.maximum(jnp.abs(u - box.centre_u) * box.rate_u, jnp.abs(v - box.centre_v) * box.rate_v)
     going = is_going(feet, limits)
     judged = going & (off <= INSIDE)
-    led_on = going & (off > INSIDE) & (off <= NEAR) & (halvings <= 0)
+    led_on = going & (off > INSIDE) & (off <= NEAR) & (halvings <= 0) & (steps < LED_ON)
 
     accepted = first.f <= best + limits.slack(first.f)
     still = (next_u == u) & (next_v == v)
@@ -208,7 +216,9 @@ def _next_trial(
     limits: Limits,
 ) -> tuple[Array, Array, Array, Array]:
     """Take a step: the next parameters, the squared distance there to third order, and whether the foot is
-    foreseen to be found there. A foot that has settled, or is held at its bounds, gets its own parameters back.
+    foreseen to be found there.
+
+    A foot that has settled, or is held at its bounds, gets its own parameters back.
     """
     always = limits.tolerance < jnp.inf
     pinned_s, pinned_t, settled = _pins(first, u, v, box, limits.tolerance)

@@ -1,11 +1,12 @@
 """Concrete queries: padded to a common size, and searched for globally where there is no start."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
+CHUNK = 1 << 18
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
 
 
@@ -38,7 +40,7 @@ def prepare(net: Any, axis_u: Axis, axis_v: Axis, sampled: bool) -> Prepared:
     return Prepared(jax.device_put(pieces), centre, samples)
 
 
-@partial(jax.jit, static_argnames="method")
+@partial(jax.jit, static_argnames=("method", "borders"))
 def _run(
     method: AbstractFootMethod,
     pieces: Pieces,
@@ -48,8 +50,9 @@ def _run(
     idle: Array,
     tolerance: Array,
     max_steps: Array,
+    borders: bool,
 ) -> dict[str, Array]:
-    feet = project(method, pieces, target, u, v, tolerance, max_steps, idle)
+    feet = project(method, pieces, target, u, v, tolerance, max_steps, idle, borders)
     return {
         "u": feet.best_u,
         "v": feet.best_v,
@@ -72,27 +75,55 @@ def feet_on_host(
 ) -> HostFeet:
     """Feet of all points, and the points on the surface; `tolerance` is a fraction of the extent."""
     prepared = prepare(net, axis_u, axis_v, sampled=start is None)
-    count = len(points)
-    size = bucket(count)
     dtype = np.dtype(net.dtype)
-    centred = np.empty((points.shape[1], count))
+    size = chunk_size(len(points))
+    centred = np.empty(points.shape[::-1])
     np.subtract(points.T, prepared.centre[:, None], out=centred)
     limits = (dtype.type(tolerance * _extent(net, prepared.centre, centred)), np.int32(max_steps))
 
-    def feet_from(which: Any, u: Any, v: Any) -> HostFeet:
+    def feet_of_chunk(*inputs: np.ndarray, borders: bool) -> dict[str, Array]:
+        idle = np.arange(size) >= inputs[0].shape[-1]
+        inputs = tuple(padded(x, size).astype(dtype, copy=False) for x in inputs)
+        return _run(method, prepared.pieces, *inputs, idle, *limits, borders)
+
+    def feet_from(which: Any, u: Any, v: Any, borders: bool = False) -> HostFeet:
         """Feet of the points `which`, from (u, v); always the same shapes."""
         chosen = centred if which is None else centred[:, which]
-        inputs = (padded(np.asarray(x), size).astype(dtype, copy=False) for x in (chosen, u, v))
-        idle = np.arange(size) >= chosen.shape[1]
-        feet = _run(method, prepared.pieces, *inputs, idle, *limits)
-        return {name: np.asarray(x)[..., : chosen.shape[1]] for name, x in feet.items()}
+        inputs = (chosen, np.asarray(u), np.asarray(v))
+        return in_chunks(partial(feet_of_chunk, borders=borders), inputs, size)
 
     if start is not None:
         best = feet_from(None, *start)
     else:
         best = globally(feet_from, prepared.samples, centred.T, size)
+    lost = np.flatnonzero(~best["converged"])
+    if lost.size:  # rare, so the search on the borders is compiled only now
+        best = {name: np.array(x) for name, x in best.items()}
+        take_nearer(best, lost, feet_from(lost, best["u"][lost], best["v"][lost], borders=True))
     best["point"] = best["point"].T + prepared.centre.astype(dtype)[None, :]
     return best
+
+
+def chunk_size(count: int) -> int:
+    """The padded size that clouds are cut into: chunks keep the CPU's cores busy and memory in its caches."""
+    most = CHUNK if jax.default_backend() == "cpu" else count
+    return bucket(-(-count // -(-count // most)))
+
+
+def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostFeet:
+    """`function` of arrays cut along their last axis, a thread for each core, the results put together."""
+    count = arrays[0].shape[-1]
+    parts = [slice(begin, min(begin + size, count)) for begin in range(0, count, size)]
+
+    def one(part: slice) -> HostFeet:
+        found = function(*(x[..., part] for x in arrays))
+        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in found.items()}
+
+    if len(parts) == 1:
+        return one(parts[0])
+    with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
+        pieces = list(pool.map(one, parts))
+    return {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
 
 
 def _extent(net: Any, centre: np.ndarray, centred: np.ndarray) -> float:
@@ -126,15 +157,15 @@ def globally(feet_from: Any, samples: Samples | None, points: np.ndarray, size: 
         everywhere_u, everywhere_v = best["u"].copy(), best["v"].copy()
         everywhere_u[which], everywhere_v[which] = other["u"], other["v"]
         rivals.found(everywhere_u, everywhere_v)
-        _take_nearer(best, which, other)
+        take_nearer(best, which, other)
     which, u, v = rivals.rest()
     for begin in range(0, which.size, size):
         part = slice(begin, begin + size)
-        _take_nearer(best, which[part], feet_from(which[part], u[part], v[part]))
+        take_nearer(best, which[part], feet_from(which[part], u[part], v[part]))
     return best
 
 
-def _take_nearer(best: HostFeet, which: np.ndarray, other: HostFeet) -> None:
+def take_nearer(best: HostFeet, which: np.ndarray, other: HostFeet) -> None:
     """Replace feet by nearer ones; `which` may name a point several times."""
     np.add.at(best["steps"], which, other["steps"])
     # Of each point's, the converged ones first and of these the nearest.

@@ -45,9 +45,7 @@ def project(
     return _in_stages(method, pieces, target, feet, limits)
 
 
-def _in_stages(
-    method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits
-) -> Feet:
+def _in_stages(method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits) -> Feet:
     """Stages: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
     from the nearest of what was found, so that "converged" always means: with respect to the whole surface.
     """

@@ -1,10 +1,10 @@
 """The search for rivals: every sample that could lead to a nearer foot than the one found, on the host.
 
 A foot at distance d can have a nearer rival elsewhere only if the sample next to the rival, at most half a
-spacing (a, b) away, is close enough: the residual e of the rival is orthogonal to the tangents (along a crease
-or border, to the one that matters, for samples lie on those), so the squared distance of that sample exceeds
-the rival's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components only. Every
-sample this close that is not beside a foot already found is a start.
+spacing (a, b) away, is close enough: the residual e of the rival is orthogonal to the tangents (along a
+crease or border, to the one that matters, for samples lie on those), so the squared distance of that sample
+exceeds the rival's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components
+only. Every sample this close that is not beside a foot already found is a start.
 """
 
 from typing import Any

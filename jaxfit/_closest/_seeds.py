@@ -44,7 +44,10 @@ def samples_per_cell(cells: int, across: int) -> int:
 
 
 def sample(pieces: Pieces) -> Samples:
-    """Sample every cell evenly, and the borders. On the host, and compiling nothing, where that can be."""
+    """Sample every cell evenly, and the borders. On the host, and compiling nothing, where that can be.
+
+    There, creases are sampled on both sides.
+    """
     axis_u, axis_v = pieces.axis_u, pieces.axis_v
     flat = pieces.coefficients.shape[-1] == 1  # a curve: nothing happens along v
     count_u = CURVE_SAMPLES if flat else samples_per_cell(axis_u.cells, axis_v.cells)
@@ -88,7 +91,11 @@ def _along(axis: Axis, count: int) -> Float[Numbers, " a"]:
     xp: Any = np if is_concrete(axis) else jnp
     share = xp.arange(count, dtype=axis.breaks.dtype) / count
     low, width = axis.breaks[:-1, None], (axis.breaks[1:] - axis.breaks[:-1])[:, None]
-    return xp.append((low + width * share[None, :]).reshape(-1), axis.breaks[-1])
+    along = xp.append((low + width * share[None, :]).reshape(-1), axis.breaks[-1])
+    if not axis.creased or not is_concrete(axis):
+        return along
+    begins = (axis.first == np.arange(axis.cells)) & (axis.breaks[:-1] > axis.breaks[0])
+    return np.sort(np.append(along, np.nextafter(axis.breaks[:-1][begins], axis.breaks[0])))
 
 
 def _sag(jet: Float[Numbers, "3 3 a b d"], a: float, b: float) -> Float[Numbers, "a b"]:
