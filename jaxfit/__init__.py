@@ -13,10 +13,15 @@ from jaxfit._closest import Newton as Newton
 from jaxfit._closest import PointStatus as PointStatus
 from jaxfit._closest import closest_point as closest_point
 from jaxfit._fit import RESULTS as RESULTS
+from jaxfit._fit import Chebyshev as Chebyshev
+from jaxfit._fit import ConstantWeight as ConstantWeight
 from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
+from jaxfit._fit import OptimalRepositioning as OptimalRepositioning
+from jaxfit._fit import Richardson as Richardson
+from jaxfit._fit import UnitWeights as UnitWeights
 from jaxfit._fit import approximate as approximate
 from jaxfit._fit import fit_points as fit_points
 from jaxfit._fit import interpolate as interpolate
