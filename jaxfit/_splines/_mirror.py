@@ -93,7 +93,7 @@ def _with_derivative(matrix: Array, values: Array, vectors: Array) -> Array:
     """
     lead, others = vectors[:, -1], vectors[:, :-1]
     gaps = values[-1] - values[:-1]
-    distinct = gaps > 0
+    distinct = gaps > float(jnp.finfo(gaps.dtype).eps) * jnp.max(jnp.abs(values))
     inverse = jnp.where(distinct, 1 / jnp.where(distinct, gaps, 1), 0)
     slopes = jnp.matmul(others.T, jnp.matmul(matrix, lead, precision=lax.Precision.HIGHEST))
     return unit(lead + others @ (inverse * slopes))

@@ -1,5 +1,6 @@
 """Reflectional symmetry of grids and nets: the plane, the projection, symmetric parameters and knots."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -8,8 +9,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfit._checks import as_floating, is_concrete
+from jaxfit._checks import as_direction, as_floating, as_vector, is_concrete
 from jaxfit._splines import _mirror
+
+Vector = ArrayLike | Sequence[float]
 
 
 class Reflection(eqx.Module):
@@ -24,8 +27,8 @@ class Reflection(eqx.Module):
     Unless told, the plane passes through the centroid of the grid (as in the paper), and its normal makes
     the deviations $\sum |Q_{ij} - M Q_{n-1-i,j}|^2$ least. With differences $D$ and midpoints $m$ of the
     pairs it is the leading eigenvector of $\sum D D^T - 4 \sum (m - c)(m - c)^T$. On symmetric data that
-    is the paper's mean direction between paired points. But no sign has to be chosen for each pair, so it also
-    holds where the surface reaches across its own plane, and a middle row counts as well.
+    is the paper's mean direction between paired points. But no pair needs a sign, so it also holds where
+    the surface reaches across its own plane, and a middle row counts as well.
 
     Parameters
     ----------
@@ -60,14 +63,12 @@ class Reflection(eqx.Module):
     point: Float[Array | np.ndarray, " d"] | None
     normal: Float[Array | np.ndarray, " d"] | None
 
-    def __init__(self, axis: int = 0, point: ArrayLike | None = None, normal: ArrayLike | None = None):
+    def __init__(self, axis: int = 0, point: Vector | None = None, normal: Vector | None = None):
         if isinstance(axis, bool) or axis not in (0, 1):
             raise ValueError(f"axis must be 0 (rows) or 1 (columns), but is {axis!r}; name the paired index.")
         self.axis = int(axis)
-        self.point = None if point is None else as_floating("point", point, 1)
-        self.normal = None if normal is None else as_floating("normal", normal, 1)
-        if self.normal is not None and is_concrete(self.normal) and not np.any(self.normal):
-            raise ValueError("normal must not be zero, since it then has no direction; give a vector.")
+        self.point = None if point is None else as_vector("point", point)
+        self.normal = None if normal is None else as_direction("normal", normal)
         if self.point is not None and self.normal is not None and self.point.shape != self.normal.shape:
             raise ValueError(
                 f"point and normal must have as many coordinates, but have {self.point.shape[0]} and "
