@@ -38,9 +38,10 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     return array
 
 
-def as_vector(name: str, x: ArrayLike | Sequence[float], dimension: int | None = None) -> Any:
+def as_vector(name: str, x: ArrayLike | Sequence[float | int], dimension: int | None = None) -> Any:
     """`x` as a floating vector (d,), of `dimension` coordinates where that is given."""
-    vector = as_floating(name, np.asarray(x) if isinstance(x, (list, tuple)) else x, 1)
+    entries: Any = np.asarray(x) if isinstance(x, (list, tuple)) else x
+    vector = as_floating(name, entries, 1)
     if dimension is not None and vector.shape != (dimension,):
         raise ValueError(
             f"{name} must have {dimension} coordinates, but has shape {vector.shape}; give a vector."
@@ -48,7 +49,7 @@ def as_vector(name: str, x: ArrayLike | Sequence[float], dimension: int | None =
     return vector
 
 
-def as_direction(name: str, x: ArrayLike | Sequence[float], dimension: int | None = None) -> Any:
+def as_direction(name: str, x: ArrayLike | Sequence[float | int], dimension: int | None = None) -> Any:
     """`as_vector`, not zero where it is concrete."""
     vector = as_vector(name, x, dimension)
     if is_concrete(vector) and not np.any(vector):

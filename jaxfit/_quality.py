@@ -12,7 +12,7 @@ from jaxfit._checks import as_direction, check_number
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._geometry import unit_normal
 
-Vector = ArrayLike | Sequence[float]
+Vector = ArrayLike | Sequence[float | int]
 
 _Z = (0.0, 0.0, 1.0)
 _Y = (0.0, 1.0, 0.0)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxfit._checks import as_direction, as_floating, as_vector, is_concrete
 from jaxfit._splines import _mirror
 
-Vector = ArrayLike | Sequence[float]
+Vector = ArrayLike | Sequence[float | int]
 
 
 class Reflection(eqx.Module):
