@@ -39,7 +39,7 @@ def hood(n=6, m=5, d=3, axis=0, noise=0.0, seed=0):
 def test_the_plane_is_found_to_the_noise(size, axis, noise):
     grid, inside, true = hood(*size, axis=axis, noise=noise)
     point, normal = Reflection(axis).plane(grid)
-    level = 20 * eps() + 2 * noise / np.sqrt(size[0] * size[1])
+    level = 20 * eps() + 4 * noise / np.sqrt(size[0] * size[1])
     assert abs((np.asarray(point) - inside) @ true) < level
     assert 1 - abs(float(normal @ true)) < level**2 + 8 * eps()
     assert float(jnp.linalg.norm(normal)) == pytest.approx(1, abs=4 * eps())
@@ -82,7 +82,7 @@ def test_what_is_given_is_kept():
     point, normal = reflection.plane(grid)
     np.testing.assert_array_equal(point, [1, 2, 3])
     np.testing.assert_array_equal(normal, [0, 0, -1])
-    np.testing.assert_array_equal(reflection.mirror([[1.0, 1.0, 1.0]]), [[1, 1, 5]])
+    np.testing.assert_array_equal(reflection.mirror(np.ones((1, 3))), [[1, 1, 5]])
     np.testing.assert_allclose(Reflection(normal=(1, 0, 0)).plane(grid)[0], grid.mean(axis=(0, 1)))
     assert Reflection(point=grid[0, 0]).plane(grid)[1].shape == (3,)
 
@@ -93,7 +93,9 @@ def test_the_unit_does_not_matter():
     outside = Reflection().located(grid)
     inside = outside.in_unit(centre, scale)
     moved = inside.symmetrise_points((grid - centre) / scale)
-    np.testing.assert_allclose(moved * scale + centre, outside.symmetrise_points(grid), atol=1e-14)
+    np.testing.assert_allclose(
+        np.asarray(moved) * scale + centre, outside.symmetrise_points(grid), atol=1e-14
+    )
     for factor in (1e-170, 1e170):
         np.testing.assert_allclose(Reflection().plane(grid * factor)[1], outside.normal, atol=1e-13)
 
@@ -253,29 +255,31 @@ def everything(grid):
     reflection = Reflection().located(grid)
     net = reflection.symmetrise_points(grid)
     u, v = reflection.symmetrise_parameters(*grid_parameters(net)[:2])
-    surface = BSplineSurface(net, reflection.symmetrise_knots(averaging_knots(u, 4)), averaging_knots(v, 4))
-    return jnp.sum(surface(0.3, 0.6) ** 2) + jnp.sum(reflection.normal[0]) + reflection.asymmetry(grid)
+    knots = reflection.symmetrise_knots(averaging_knots(u, 4))
+    numbers = (net**2, reflection.normal[0], reflection.asymmetry(grid), u**2, v**2, knots**2)
+    return sum(jnp.sum(x) for x in numbers)
+
+
+@pytest.fixture(scope="module")
+def value_and_slope():
+    return jax.jit(jax.value_and_grad(everything))
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_everything_goes_through_jit_and_grad(size):
+def test_everything_goes_through_jit_and_grad(size, value_and_slope):
     grid = jnp.asarray(hood(*size, noise=0.05)[0])
-    function = jax.jit(everything)
-    np.testing.assert_allclose(function(grid), everything(grid), rtol=1e-12)
-    slope = jax.jit(jax.grad(everything))(grid)
+    value, slope = value_and_slope(grid)
+    np.testing.assert_allclose(value, everything(grid), rtol=1e-12)
     way = jnp.asarray(np.random.default_rng(3).normal(size=grid.shape))
     step = 1e-6
-    difference = (function(grid + step * way) - function(grid - step * way)) / (2 * step)
+    difference = (value_and_slope(grid + step * way)[0] - value_and_slope(grid - step * way)[0]) / (2 * step)
     np.testing.assert_allclose(jnp.sum(slope * way), difference, rtol=1e-6)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_gradients_are_finite_on_symmetric_and_on_degenerate_grids(noise):
-    gradient = jax.jit(jax.grad(everything))
-    flat = np.array(hood(6, 5)[0])
-    flat[..., 2] = 0.5  # two eigenvalues may coincide
-    for grid in (hood(6, 5, noise=noise)[0], flat, np.zeros((6, 5, 3))):
-        assert np.isfinite(gradient(grid)).all()
+def test_gradients_are_finite_on_symmetric_and_on_degenerate_grids(value_and_slope):
+    line = hood()[0] * np.array([1.0, 0.0, 0.0])  # two eigenvalues coincide
+    for grid in (hood()[0], line, np.zeros((6, 5, 3))):
+        assert np.isfinite(value_and_slope(jnp.asarray(grid))[1]).all()
 
 
 def test_a_batch_is_its_grids():
@@ -315,20 +319,20 @@ def test_a_grid_of_stripes_is_its_points():
     surface = wavy_surface()
     us, vs = np.linspace(0, 1, 9), np.linspace(0, 1, 8)
     grid = zebra_grid(surface, us, vs, stripes=3)
-    points = zebra(surface, us[:, None], vs[None, :], stripes=3)
-    np.testing.assert_allclose(grid, points, atol=1e3 * eps())
+    u, v = (x.ravel() for x in np.meshgrid(us, vs, indexing="ij"))
+    points = zebra(surface, u[:40], v[:40], stripes=3)
+    np.testing.assert_allclose(grid.ravel()[:40], points, atol=1e3 * eps())
 
 
 def test_a_plane_has_one_value():
-    x, y = np.meshgrid(np.linspace(0, 2, 6), np.linspace(0, 1, 5), indexing="ij")
-    plane = np.stack([x, y, 0.3 * x - 0.2 * y], axis=-1)
-    surface = BSplineSurface(plane, clamped_uniform(6, 4), clamped_uniform(5, 4))
-    assert np.ptp(zebra_grid(surface, np.linspace(0, 1, 9), np.linspace(0, 1, 9))) < 1e-13
+    onto = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.3, -0.2, 0.0]])
+    plane = wavy_surface().affine(onto)
+    assert np.ptp(zebra_grid(plane, np.linspace(0, 1, 9), np.linspace(0, 1, 8))) < 1e-12
 
 
 @pytest.mark.parametrize("direction", [(0, 1, 0.3), (1, 0, 0)])
 def test_a_symmetric_surface_has_symmetric_stripes(direction):
-    us, vs = np.linspace(0, 1, 13), np.linspace(0, 1, 9)
+    us, vs = np.linspace(0, 1, 9), np.linspace(0, 1, 8)
     values = zebra_grid(symmetric_surface(), us, vs, direction, 12, (0, 0.5, 1))
     np.testing.assert_allclose(values, values[::-1], atol=1e-11)
     assert np.ptp(values) > 0.9
@@ -336,22 +340,24 @@ def test_a_symmetric_surface_has_symmetric_stripes(direction):
 
 def test_both_sides_and_ends_of_the_axis_are_alike():
     surface = wavy_surface()
-    u, v = np.random.default_rng(0).uniform(size=(2, 20))
+    u, v = np.random.default_rng(0).uniform(size=(2, 40))
     values = zebra(surface, u, v, (1.0, 2.0, 0.0))
-    np.testing.assert_allclose(zebra(surface.transpose(), v, u, (-1.0, -2.0, 0.0)), values, atol=1e-12)
+    # Run through backwards, u turns the normal round.
+    other = BSplineSurface(surface.control_points[::-1], 1 - surface.knots_u[::-1], surface.knots_v)
+    np.testing.assert_allclose(zebra(other, 1 - u, v, (-1.0, -2.0, 0.0)), values, atol=1e-12)
 
 
 def test_stripes_go_through_jit_and_grad():
     surface = wavy_surface()
-    slope = jax.jit(jax.grad(lambda s: zebra(s, 0.3, 0.4)))(surface)
-    assert np.isfinite(slope.control_points).all()
-    flat = surface.affine(np.diag([1.0, 1.0, 0.0]))
-    slope = jax.grad(lambda s: zebra(s, 0.3, 0.4, (0, 0, 1)))(flat)  # the ray is the axis
-    assert np.isfinite(slope.control_points).all()
+    flat = surface.affine(np.diag([1.0, 1.0, 0.0]))  # in which the ray is the axis
+    gradient = jax.jit(jax.grad(lambda s: zebra(s, 0.3, 0.4, (0, 0, 1))))
+    for slope in (gradient(surface), gradient(flat)):
+        assert np.isfinite(slope.control_points).all()
 
 
 def test_where_there_is_no_normal_there_is_no_stripe():
-    assert np.isnan(zebra(wavy_surface().affine(np.diag([1.0, 0.0, 0.0])), 0.5, 0.5))
+    line = wavy_surface().affine(np.diag([1.0, 0.0, 0.0]))
+    assert np.isnan(zebra(line, *np.full((2, 40), 0.5))).all()
 
 
 def test_impossible_stripes_get_a_sentence():
@@ -366,7 +372,7 @@ def test_impossible_stripes_get_a_sentence():
     with pytest.raises(ValueError, match="three dimensions"):
         zebra(flat, 0.5, 0.5)
     with pytest.raises(ValueError, match="three dimensions"):
-        zebra_grid(flat, [0.5], [0.5])
+        zebra_grid(flat, np.zeros(2), np.zeros(2))
 
 
 # ---------------------------------------------------------------- the picture
@@ -377,7 +383,8 @@ def zebra_stripes(monkeypatch):
     pytest.importorskip("matplotlib")
     from jaxfit.plot import zebra_stripes
 
-    monkeypatch.setattr("jaxfit.plot._render._PIXELS", 300)
+    monkeypatch.setattr("jaxfit.plot._render._PIXELS", 160)
+    monkeypatch.setattr("jaxfit.plot._render._MOST", 200)  # one shape, compiled once
     return zebra_stripes
 
 
@@ -397,11 +404,12 @@ def test_stripes_of_two_surfaces_are_saved_side_by_side(tmp_path, zebra_stripes)
     assert np.mean(np.abs(left - right) > 0.3) < 0.06  # along the edges of the stripes only
 
 
-def test_one_surface_needs_no_list_and_a_pole_is_drawn(zebra_stripes):
-    surface = wavy_surface()
-    assert len(zebra_stripes(surface).axes) == 1
-    line = surface.affine(np.diag([1.0, 0.0, 0.0]))
-    zebra_stripes([line])
+def test_one_surface_needs_no_list_and_has_no_stripe_without_a_normal(zebra_stripes):
+    figure = zebra_stripes(wavy_surface().affine(np.diag([1.0, 0.0, 0.0])), direction=(0, 1, 0))
+    assert len(figure.axes) == 1
+    image = np.asarray(figure.axes[0].images[0].get_array())
+    red = image[image[..., 3] > 0.99]
+    assert (red[:, 0] > red[:, 1] + 0.5).all()
 
 
 def test_impossible_pictures_get_a_sentence(tmp_path, zebra_stripes):
