@@ -140,8 +140,7 @@ def test_impossible_reflections_get_a_sentence():
 
 @pytest.mark.float32_too
 @pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize(("size", "d"), [((6, 5), 2), ((7, 5), 3)])
 def test_symmetrised_points_are_symmetric_to_the_bit(size, d, axis):
     grid, _, _ = hood(*size, d=d, axis=axis, noise=0.1)
     reflection = Reflection(axis).located(grid)
@@ -265,9 +264,8 @@ def value_and_slope():
     return jax.jit(jax.value_and_grad(everything))
 
 
-@pytest.mark.parametrize("size", SIZES)
-def test_everything_goes_through_jit_and_grad(size, value_and_slope):
-    grid = jnp.asarray(hood(*size, noise=0.05)[0])
+def test_everything_goes_through_jit_and_grad(value_and_slope):
+    grid = jnp.asarray(hood(7, 5, noise=0.05)[0])
     value, slope = value_and_slope(grid)
     np.testing.assert_allclose(value, everything(grid), rtol=1e-12)
     way = jnp.asarray(np.random.default_rng(3).normal(size=grid.shape))
@@ -277,8 +275,9 @@ def test_everything_goes_through_jit_and_grad(size, value_and_slope):
 
 
 def test_gradients_are_finite_on_symmetric_and_on_degenerate_grids(value_and_slope):
-    line = hood()[0] * np.array([1.0, 0.0, 0.0])  # two eigenvalues coincide
-    for grid in (hood()[0], line, np.zeros((6, 5, 3))):
+    exact = hood(7, 5)[0]
+    line = exact * np.array([1.0, 0.0, 0.0])  # two eigenvalues coincide
+    for grid in (exact, line, np.zeros((7, 5, 3))):
         assert np.isfinite(value_and_slope(jnp.asarray(grid))[1]).all()
 
 
