@@ -200,7 +200,8 @@ def test_parameters_become_symmetric_to_the_bit(size, axis):
     rng = np.random.default_rng(0)
     vectors = [np.append(0, np.cumsum(rng.uniform(0.1, 1, n - 1))) for n in size]
     given = [(x / x[-1]).astype(jnp.result_type(float)) for x in vectors]
-    per_point = rng.uniform(size=(2, *size)).astype(given[0].dtype)
+    per_point = np.stack(np.meshgrid(*given, indexing="ij")) ** rng.uniform(0.9, 1.1, (2, *size))
+    per_point = per_point.astype(given[0].dtype)
     reflection = Reflection(axis)
     vectors = reflection.symmetrise_parameters(*given)
     paired = np.asarray(vectors[axis])

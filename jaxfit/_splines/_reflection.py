@@ -148,8 +148,8 @@ class Reflection(eqx.Module):
         r"""Symmetric parameters on [0, 1], either one vector per direction or one pair per point.
 
         Of the paired direction $t_i \leftarrow (t_i + 1 - t_{n-1-i}) / 2$. Of the other one vectors stay
-        as they are, and each point's own parameter becomes the mean of its pair. Pairs then sum to 1 (or
-        are equal) to the last bit; increasing parameters stay increasing.
+        as they are, and each point's own parameter becomes the mean of its pair. Increasing
+        parameters stay increasing, and their pairs sum to 1 (or are equal) to the last bit.
 
         Parameters
         ----------
