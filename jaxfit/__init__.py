@@ -29,12 +29,14 @@ from jaxfit._parameters import Centripetal as Centripetal
 from jaxfit._parameters import ChordLength as ChordLength
 from jaxfit._parameters import curve_parameters as curve_parameters
 from jaxfit._parameters import grid_parameters as grid_parameters
+from jaxfit._quality import zebra as zebra
 from jaxfit._splines import BezierCurves as BezierCurves
 from jaxfit._splines import BezierPatches as BezierPatches
 from jaxfit._splines import BSplineCurve as BSplineCurve
 from jaxfit._splines import BSplineSurface as BSplineSurface
 from jaxfit._splines import Curvature as Curvature
 from jaxfit._splines import FirstForm as FirstForm
+from jaxfit._splines import Reflection as Reflection
 from jaxfit._splines import SecondForm as SecondForm
 from jaxfit._splines import averaging_knots as averaging_knots
 from jaxfit._splines import clamped_uniform_knots as clamped_uniform_knots
