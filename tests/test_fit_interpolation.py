@@ -110,6 +110,24 @@ def test_feet_outside_the_stencil_are_met_all_the_same():
     np.testing.assert_allclose(np.linalg.norm(at - grid, axis=-1) / diagonal(grid), fit.errors, atol=1e-12)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_symmetric_fit_meets_the_symmetrised_data_with_a_symmetric_net(axis):
+    noisy = GRID + np.random.default_rng(0).normal(scale=2e-3, size=GRID.shape)
+    noisy[..., axis] = noisy[..., axis] + 5.0  # the plane need not pass through the origin
+    reflection = jf.Reflection(axis, normal=np.eye(3)[axis])
+    fit = jf.interpolate(noisy, jf.GeometricInterpolation(symmetry=reflection))
+    assert bool(fit.converged), fit.message
+    fixed = reflection.located(noisy)
+    net = np.asarray(fit.surface.control_points)
+    assert float(fixed.asymmetry(net)) <= 1e-14 * diagonal(noisy)
+    meant = np.asarray(fixed.symmetrise_points(noisy))
+    met = np.asarray(fit.surface(fit.u, fit.v))
+    assert np.abs(met - meant).max() <= 5e-12 * diagonal(noisy)
+    freely = jf.interpolate(noisy)
+    assert float(fixed.asymmetry(freely.surface.control_points)) > 1e-4
+    assert int(fit.stats["num_steps"]) <= 1.1 * int(freely.stats["num_steps"])
+
+
 def test_one_step_is_equations_13_and_14():
     fit = jf.interpolate(GRID, PLAIN, max_steps=1)
     parameters = jf.grid_parameters(GRID)

@@ -11,6 +11,7 @@ from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border, measure_feet
 from jaxfit._fit._repositioning import AbstractRepositioning, OptimalRepositioning
 from jaxfit._parameters import AbstractParametrisation, ChordLength
+from jaxfit._splines import Reflection
 from jaxfit._splines._pieces import Pieces
 
 
@@ -50,6 +51,9 @@ class GeometricInterpolation(AbstractIterativeMethod):
         How feet are brought up to date (default Newton).
     foot_tolerance : float
         To what tangential error, as a fraction of the diagonal.
+    symmetry : Reflection(), optional
+        Reflectional symmetry of the surface (section 3.2). Data, parameters and knots are made symmetric
+        once, which the iteration keeps: the fit meets the symmetrised data, with a symmetric net.
     stall_window, stall_gain : int, float
         The fit stops as stalled when neither error has fallen by the share `stall_gain` within
         `stall_window` iterations, as it does at rounding level.
@@ -62,6 +66,7 @@ class GeometricInterpolation(AbstractIterativeMethod):
     local: bool = False
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-13
+    symmetry: Reflection | None = None
     stall_window: int = 40
     stall_gain: float = 0.1
 

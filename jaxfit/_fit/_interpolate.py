@@ -1,5 +1,6 @@
 """The verb for grids: a surface through all of them."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -76,8 +77,17 @@ def interpolate(
     n, m, d = data.shape
     unit = unit_of(data.reshape(-1, d))
     inner = unit.inward(data)
+    symmetry = method.symmetry
+    if symmetry is not None:
+        symmetry = symmetry.in_unit(unit.centre, unit.scale).located(inner)
+        inner = symmetry.symmetrise_points(inner)
+        data = unit.outward(np.asarray(inner) if is_concrete(inner) else inner)
+        method = dataclasses.replace(method, symmetry=None)
     parameters = grid_parameters(inner, method.parametrisation)
-    knots = [averaging_knots(t, k) for t, k in zip(parameters[:2], order, strict=True)]
+    starts = parameters[:2] if symmetry is None else symmetry.symmetrise_parameters(*parameters[:2])
+    knots = [averaging_knots(t, k) for t, k in zip(starts, order, strict=True)]
+    if symmetry is not None:
+        knots[symmetry.axis] = symmetry.symmetrise_knots(knots[symmetry.axis])
     net = jnp.asarray(inner)
     surface = BSplineSurface(net, *knots)
     if tolerance is None:
@@ -89,11 +99,10 @@ def interpolate(
     problem = make_problem(cloud, None, surface, unit, method.foot_tolerance, padded=False)
     dtype = problem.target.dtype
     if method.needs_spectrum:
-        averaged = (parameters.u.astype(dtype), parameters.v.astype(dtype))
+        averaged = tuple(x.astype(dtype) for x in starts)
         lowest = lowest_eigenvalue((problem.axis_u, problem.axis_v), averaged)
         problem = eqx.tree_at(lambda p: p.lowest, problem, lowest, is_leaf=lambda x: x is None)
-    u = jnp.repeat(parameters.u.astype(dtype), m)
-    v = jnp.tile(parameters.v.astype(dtype), n)
+    u, v = jnp.repeat(starts[0].astype(dtype), m), jnp.tile(starts[1].astype(dtype), n)
     limits = Limits(
         jnp.asarray(jnp.inf, dtype),
         jnp.asarray(tolerance, dtype),
@@ -101,6 +110,8 @@ def interpolate(
     )
     carry = begin(surface.control_points.astype(dtype), u, v, max_steps)
     carry = run(method, problem, limits, carry, progress if is_concrete(data) else None)
+    if symmetry is not None:
+        carry = eqx.tree_at(lambda c: c.net, carry, symmetry.symmetrise_points(carry.net))
     return _finished(carry, problem, unit, data, surface, throw)
 
 
