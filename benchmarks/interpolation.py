@@ -1,0 +1,123 @@
+"""Interpolation of grids: the options of the geometric method, iterations, errors and times.
+
+    python benchmarks/interpolation.py [--runs 5] [--data FOLDER] [--program ORACLE --work FOLDER]
+
+One row for each grid and method: iterations, maximum and average error in per cent of the diagonal,
+evaluations of the surface per point, the median time of a fit with the spread (lowest to highest), and the
+first call, which compiles. With the program of an independent implementation and its work folder, the same runs
+there follow.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / x) for x in ("", "tests")]
+jax.config.update("jax_enable_x64", True)
+
+import helpers
+
+import jaxfit as jf
+
+GRIDS = (
+    "hood_beetle_10x10",
+    "fran_face_45x49",
+    "fuselage_d150_50x200",
+    "fuselage_d150_100x400",
+    "jacksboro_dem",
+)
+STAND_INS = ("hood", "fus10k", "fus40k")
+UNIT = jf.UnitWeights()
+METHODS = {
+    "plain": (jf.GeometricInterpolation(repositioning=UNIT, freeze_after=None), "weight=none fix=0"),
+    "frozen feet": (jf.GeometricInterpolation(repositioning=UNIT), "weight=none fix=2"),
+    "weights (27)": (jf.GeometricInterpolation(freeze_after=None), "weight=opt fix=0"),
+    "constant (17)": (
+        jf.GeometricInterpolation(repositioning=jf.ConstantWeight(), freeze_after=None),
+        "weight=lu fix=0",
+    ),
+    "frozen + (27)": (jf.GeometricInterpolation(), "weight=opt fix=2"),
+    "Chebyshev": (jf.GeometricInterpolation(repositioning=UNIT, acceleration=jf.Chebyshev()), None),
+}
+# The tables of the paper stop at rounding level, which is relative to the size of the grid.
+TOLERANCE = {"hood": 4e-14, "fus10k": 2e-15, "fus40k": 2e-15}
+
+
+def row(grid, name, method, tolerance, runs):
+    """Fit `runs` times after the first, and print."""
+    times = []
+    for _ in range(runs + 1):
+        begin = time.perf_counter()
+        fit = jf.interpolate(grid, method, tolerance=tolerance, max_steps=600)
+        jax.block_until_ready(fit.surface)
+        times.append(time.perf_counter() - begin)
+    first, *times = times
+    evaluations = float(np.nansum(np.asarray(fit.history.evaluations)))
+    print(
+        f"  {name:<14}{int(fit.stats['num_steps']):>5}  {100 * float(fit.maximum_error):9.2e}"
+        f"  {100 * float(fit.average_error):9.2e}  {evaluations:7.1f}  {np.median(times):8.4f} s"
+        f" [{min(times):.4f}, {max(times):.4f}]  first {first:5.2f} s  "
+        f"{'' if bool(fit.converged) else fit.message}",
+        flush=True,
+    )
+
+
+def program_row(options, name, arguments, tolerance):
+    """The same run in the other program, which prints one line of JSON."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [options.program, "ginterp", f"grid={options.work / name}.npy", f"tol={tolerance}"]
+        command += ["cptol=1e-13", f"out={folder}/k", *arguments.split()]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    print(
+        f"  {'  other program':<14}{found['iters']:>4}  {100 * found['max']:9.2e}  {100 * found['avg']:9.2e}"
+        f"  {'':7}  {found['cpu']:8.4f} s"
+    )
+
+
+def table(name, grid, tolerance, options, stand_in):
+    """All methods on one grid."""
+    print(f"{name}: {grid.shape[0]} x {grid.shape[1]} points, tolerance {100 * tolerance:g} %")
+    for label, (method, arguments) in METHODS.items():
+        if options.methods and label not in options.methods:
+            continue
+        row(grid, label, method, tolerance, options.runs)
+        if stand_in and options.program and arguments:
+            program_row(options, name, arguments, tolerance)
+
+
+def main():
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=int, default=5, help="timed fits of each kind, after one")
+    parser.add_argument("--data", type=Path, default=helpers.FOLDER, help="folder of the .npz files")
+    parser.add_argument("--program", type=Path, help="an independent implementation to run beside")
+    parser.add_argument("--work", type=Path, help="its folder of grids (.npy)")
+    parser.add_argument("--grids", nargs="*", help="only these")
+    parser.add_argument("--methods", nargs="*", help="only these")
+    options = parser.parse_args()
+    print(f"jax {jax.__version__}, {jax.default_backend()}, {os.cpu_count()} cores, float64")
+    print("  method        steps  max err %  avg err %  evaluations  median time [lowest, highest]")
+    for name in STAND_INS if options.work else ():
+        if not options.grids or name in options.grids:
+            table(name, np.load(options.work / f"{name}.npy"), TOLERANCE[name], options, True)
+    for name in GRIDS:
+        path = options.data / f"{name}.npz"
+        if options.grids and name not in options.grids:
+            continue
+        if not path.is_file():
+            print(f"{name}: not in {options.data}, left out")
+            continue
+        table(name, np.load(path)["grid"], 1e-14, options, False)
+
+
+if __name__ == "__main__":
+    main()
