@@ -17,6 +17,7 @@ from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
+from jaxfit._fit import StandardInterpolation as StandardInterpolation
 from jaxfit._fit import approximate as approximate
 from jaxfit._fit import fit_points as fit_points
 from jaxfit._fit import interpolate as interpolate

@@ -8,3 +8,4 @@ from jaxfit._fit._geometric_approximation import GeometricApproximation as Geome
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit._interpolate import interpolate as interpolate
 from jaxfit._fit._results import RESULTS as RESULTS
+from jaxfit._fit._standard_interpolation import StandardInterpolation as StandardInterpolation

@@ -13,6 +13,8 @@ from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._loop import Limits, begin, run
 from jaxfit._fit._measure import border
 from jaxfit._fit._problem import make_problem, unit_of
+from jaxfit._fit._standard_fit import standard_fit
+from jaxfit._fit._standard_interpolation import StandardInterpolation
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import advise_x64
 from jaxfit._splines import BSplineSurface, averaging_knots
@@ -22,7 +24,7 @@ DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 
 def interpolate(
     grid: ArrayLike,
-    method: GeometricInterpolation | None = None,
+    method: GeometricInterpolation | StandardInterpolation | None = None,
     order: tuple[int, int] = (4, 4),
     tolerance: float | None = None,
     max_steps: int = 1000,
@@ -35,14 +37,14 @@ def interpolate(
     ----------
     grid : array (n, m, d)
         Any unit; at least `order` points in each direction.
-    method : GeometricInterpolation, optional
+    method : GeometricInterpolation or StandardInterpolation, optional
     order : (K, L)
         Degree + 1 along the first and the second index, each 2 to 8.
     tolerance : float, optional
         The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
         1e-12 in float64, 2e-6 in float32.
     max_steps : int
-        Most iterations.
+        Most iterations (of `StandardInterpolation`, cycles of GMRES).
     progress : callable, optional
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
     throw : bool
@@ -60,8 +62,8 @@ def interpolate(
 
     Notes
     -----
-    Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
-    differentiate through a fit raises a TypeError. On a closed grid (first row equal to the last) the feet
+    Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
+    differentiate through a geometric fit raises a TypeError, standard fits are differentiable. On a closed grid (first row equal to the last) the feet
     stay on their side of the seam.
     """
     check_order(order)
@@ -70,6 +72,8 @@ def interpolate(
         check_number("tolerance", tolerance, 0.0)
     data = _checked_grid(grid, order)
     method = GeometricInterpolation() if method is None else method
+    if isinstance(method, StandardInterpolation):
+        return standard_fit(method, data, order, tolerance, max_steps, throw)
     check_kind("method", method, GeometricInterpolation, "GeometricInterpolation()")
     n, m, d = data.shape
     unit = unit_of(data.reshape(-1, d))
