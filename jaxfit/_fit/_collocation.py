@@ -1,8 +1,8 @@
 r"""The collocation systems of grids: tensor products, and one with a parameter pair for every point.
 
-With parameters $u_i$ of rows and $v_j$ of columns, $\sum_{kl} N_k(u_i) N_l(v_j) P_{kl} = Q_{ij}$ falls apart into
-banded systems in one direction after the other. With parameters $(u_{ij}, v_{ij})$ it is one sparse system
-N P = Q; that is solved by restarted GMRES, the tensor product being the preconditioner.
+With parameters $u_i$ of rows and $v_j$ of columns, $\sum_{kl} N_k(u_i) N_l(v_j) P_{kl} = Q_{ij}$ falls
+apart into banded systems in one direction after the other. With parameters $(u_{ij}, v_{ij})$ it is one
+sparse system N P = Q; that is solved by restarted GMRES, the tensor product being the preconditioner.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jax.scipy.sparse.linalg import gmres
 from jaxtyping import Float, Int
 
 from jaxfit._splines import _banded as banded
 from jaxfit._splines._basis import spans_and_weights
 
-CYCLE_GAIN = 1e-6  # what a cycle of GMRES aims at; the next one starts from the true residual
 Solver = Callable[[Array], Array]
 
 
@@ -120,56 +118,85 @@ def improved(
     limits: tuple[Array, Array, Array],
     restart: int,
 ) -> tuple[Array, Account]:
-    """Cycles of GMRES from `net`, whose errors `account` has noted last, until the largest error is within the
-    tolerance, or a cycle takes less than a tenth of it away, or `most` are done.
+    """Cycles of GMRES from `net`, whose errors `account` has noted last, until the largest error is within
+    the tolerance, or a cycle takes less than a tenth of it away, or `most` are done.
 
     `limits` are the diagonal, the tolerance and `most`. A cycle that makes the largest error greater is not
     accepted.
     """
     diagonal, tolerance, most = limits
+    State = tuple[Array, Array, Account, Array]
 
-    def goes_on(carry: tuple[Array, Account, Array]) -> Array:
-        _, account, slow = carry
+    def goes_on(state: State) -> Array:
+        _, _, account, slow = state
         return ~slow & (account.maximum[account.step] > tolerance) & (account.step < most)
 
-    def cycle(carry: tuple[Array, Account, Array]) -> tuple[Array, Account, Array]:
-        net, account, _ = carry
-        change = cycle_of(system.times, precondition, data - system.times(net), restart)
-        error = distances(data - system.times(net + change), diagonal)
-        before, after = account.maximum[account.step], jnp.max(error)
-        better = after < before
-        old = distances(data - system.times(net), diagonal)
-        account = account.noted(account.step + 1, jnp.where(better, error, old))
-        return jnp.where(better, net + change, net), account, ~(after < 0.9 * before)
+    def cycle(state: State) -> State:
+        net, residual, account, _ = state
+        moved = net + krylov_step(system.times, precondition, residual, restart)
+        rest = data - system.times(moved)
+        error, before = distances(rest, diagonal), account.maximum[account.step]
+        better = jnp.max(error) < before
+        kept = jnp.where(better, error, distances(residual, diagonal))
+        slow = ~(jnp.max(error) < 0.9 * before)
+        account = account.noted(account.step + 1, kept)
+        return jnp.where(better, moved, net), jnp.where(better, rest, residual), account, slow
 
-    net, account, _ = lax.while_loop(goes_on, cycle, (net, account, jnp.asarray(False)))
+    begin = (net, data - system.times(net), account, jnp.asarray(False))
+    net, _, account, _ = lax.while_loop(goes_on, cycle, begin)
     return net, account
 
 
-def cycle_of(apply: Solver, precondition: Solver, right: Array, restart: int) -> Array:
-    """One cycle of GMRES from zero."""
-    options = {"tol": CYCLE_GAIN, "restart": restart, "maxiter": 1, "solve_method": "incremental"}
-    return gmres(apply, right, M=precondition, **options)[0]
+def krylov_step(apply: Solver, precondition: Solver, right: Array, restart: int) -> Array:
+    """One cycle of GMRES from zero: the x of the Krylov space for which M (right - A x) is smallest.
+
+    Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986; twice classical Gram-Schmidt. An exhausted space
+    adds zero vectors, which the least-squares problem leaves alone.
+    """
+    first = precondition(right).reshape(-1)
+    size = jnp.linalg.norm(first)
+    least = jnp.finfo(right.dtype).tiny
+    basis = jnp.zeros((restart + 1, first.shape[0]), right.dtype).at[0].set(first / jnp.maximum(size, least))
+    projected = jnp.zeros((restart + 1, restart), right.dtype)
+
+    def extend(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        basis, projected = state
+        new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
+        scale = jnp.linalg.norm(new)
+        shares = jnp.zeros(restart + 1, right.dtype)
+        for _ in range(2):
+            share = basis @ new
+            new, shares = new - share @ basis, shares + share
+        length = jnp.linalg.norm(new)
+        fresh = length > 10 * jnp.finfo(right.dtype).eps * scale
+        length = jnp.where(fresh, length, 0.0)
+        basis = basis.at[k + 1].set(jnp.where(fresh, new / jnp.where(fresh, length, 1.0), 0.0))
+        return basis, projected.at[:, k].set(shares.at[k + 1].set(length))
+
+    basis, projected = lax.fori_loop(0, restart, extend, (basis, projected))
+    goal = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
+    weights = jnp.linalg.lstsq(projected, goal)[0]
+    return (weights @ basis[:-1]).reshape(right.shape)
 
 
 def _krylov(apply: Solver, precondition: Solver, right: Array, restart: int) -> Array:
     """GMRES to rounding level, relative to `right`: what derivatives are solved with."""
     goal = 100 * jnp.finfo(right.dtype).eps * jnp.max(jnp.abs(right))
+    State = tuple[Array, Array, Array]
 
-    def goes_on(carry: tuple[Array, Array, Array]) -> Array:
-        _, size, slow = carry
-        return ~slow & (size > goal)
+    def goes_on(state: State) -> Array:
+        _, residual, slow = state
+        return ~slow & (jnp.max(jnp.abs(residual)) > goal)
 
-    def cycle(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        x, before, _ = carry
-        moved = x + cycle_of(apply, precondition, right - apply(x), restart)
-        after = jnp.max(jnp.abs(right - apply(moved)))
+    def cycle(state: State) -> State:
+        x, residual, _ = state
+        moved = x + krylov_step(apply, precondition, residual, restart)
+        rest = right - apply(moved)
+        before, after = jnp.max(jnp.abs(residual)), jnp.max(jnp.abs(rest))
         better = after < before
-        size = jnp.where(better, after, before)
-        return jnp.where(better, moved, x), size, ~(after < 0.9 * before)
+        return jnp.where(better, moved, x), jnp.where(better, rest, residual), ~(after < 0.9 * before)
 
-    begin = (jnp.zeros_like(right), jnp.max(jnp.abs(right)), jnp.asarray(False))
-    return lax.while_loop(goes_on, cycle, begin)[0]
+    return lax.while_loop(goes_on, cycle, (jnp.zeros_like(right), right, jnp.asarray(False)))[0]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))

@@ -62,9 +62,9 @@ def interpolate(
 
     Notes
     -----
-    Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
-    differentiate through a geometric fit raises a TypeError, standard fits are differentiable. On a closed grid (first row equal to the last) the feet
-    stay on their side of the seam.
+    Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; standard fits
+    are differentiable too, while to differentiate through a geometric one raises a TypeError. On a closed
+    grid (first row equal to the last) the feet stay on their side of the seam.
     """
     check_order(order)
     check_number("max_steps", max_steps, 0, whole=True)

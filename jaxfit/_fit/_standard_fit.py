@@ -40,8 +40,6 @@ def standard_fit(
         tolerance = DEFAULT_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
     elif is_concrete(tolerance):
         advise_x64(float(tolerance), np.dtype(dtype))
-    if concrete:
-        _check_extent(method, inner)
     xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
     limits = (
         xp.asarray(unit.diagonal / unit.scale, dtype),
@@ -50,27 +48,27 @@ def standard_fit(
     )
     room = bucket(int(max_steps) + 1) if method.iterative else 1
     solution = solved(method, (int(order[0]), int(order[1])), room, inner, limits)
-    if is_concrete(solution) and not np.isfinite(solution.net).all():
-        raise ValueError(
-            f"grid is too unevenly spaced for order {tuple(order)} in {np.dtype(dtype)}, since its collocation "
-            "matrix is singular to rounding; lower the order, or remove points that repeat."
-        )
+    if is_concrete(solution):
+        _check(method, order, inner, solution)
     return _fit(solution, unit, grid, limits, throw)
 
 
-def _check_extent(method: StandardInterpolation, inner: np.ndarray) -> None:
-    """Raise where all rows along one index have length zero: these have no parameters."""
-    noise = 4 * np.finfo(inner.dtype).eps * np.abs(inner).max()
-    for axis in (0, 1):
-        # No row is longer than its extent in one coordinate; the exact test is the parametrisation's own.
-        if np.ptp(inner, axis=axis).max() <= noise * inner.shape[axis]:
-            grid_parameters(inner, method.parametrisation)
+def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, solution: Solution) -> None:
+    """Raise where a grid has no parameters, so that the traced part made some up, or no solution."""
+    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
+    if (np.asarray(solution.extent) <= noise).any():
+        # The exact test is the parametrisation's own; no row is shorter than its longest step.
+        grid_parameters(inner, method.parametrisation)
+    if not np.isfinite(solution.net).all():
+        raise ValueError(
+            f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
+            "matrix is singular to rounding; lower the order, or remove points that repeat."
+        )
 
 
 def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any], throw: bool) -> Fit:
     concrete = is_concrete(solution)
     account = solution.account
-    maximum, average = account.maximum[account.step], account.average[account.step]
     net = unit.outward(np.asarray(solution.net) if concrete else solution.net)
     ends = np.asarray([0, -1])
     corner = ends[:, None], ends[None, :]
@@ -93,10 +91,10 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any]
         u=solution.u,
         v=solution.v,
         errors=solution.errors,
-        average_error=average,
-        maximum_error=maximum,
+        average_error=solution.average,
+        maximum_error=solution.maximum,
         history=_history(account),
-        result=_ending(maximum, account.step, limits, net, throw),
+        result=_ending(solution.maximum, account.step, limits, net, throw),
         stats=stats,
     )
 

@@ -95,6 +95,9 @@ class Solution(eqx.Module):
     v: Float[Array, "n m"]
     errors: Float[Array, "n m"]
     account: Account
+    average: Array
+    maximum: Array
+    extent: Float[Array, "2"]
     corrections: Array
     parameter_change: Array
     lost: Array  # closest points not found to the tolerance
@@ -116,7 +119,7 @@ class Corrected(eqx.Module):
     u: Array
     v: Array
     account: Account
-    number: Array
+    number: Array  # of corrections
     change: Array
     lost: Array
     slow: Array
@@ -145,11 +148,31 @@ def solved(
         v = jnp.broadcast_to(averaged[1][None, :], (n, m))
     if method.iterative:
         return _iterated(method, order, room, task, net, u, v)
-    residual = data - tensor.times(net)
-    errors = lax.stop_gradient(distances(residual, limits[0]))
+    errors = lax.stop_gradient(distances(data - tensor.times(net), limits[0]))
     zero = jnp.asarray(0, jnp.int32)
-    account = _account(room, errors)
-    return Solution(net, knots, u, v, errors, account, zero, jnp.zeros((), data.dtype), zero)
+    rest = jnp.zeros((), data.dtype)
+    found = Corrected(net, u, v, _account(room, errors), zero, rest, zero, jnp.asarray(False))
+    return _solution(task, net, u, v, errors, found)
+
+
+def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: Corrected) -> Solution:
+    account = found.account
+    # How far the grid reaches along either index: if nowhere, its parameters are made up.
+    extent = jnp.stack([jnp.max(jnp.abs(jnp.diff(task.data, axis=axis))) for axis in (0, 1)])
+    return Solution(
+        net=net,
+        knots=task.knots,
+        u=u,
+        v=v,
+        errors=errors,
+        account=account,
+        average=account.average[account.step],
+        maximum=account.maximum[account.step],
+        extent=lax.stop_gradient(extent),
+        corrections=found.number,
+        parameter_change=found.change,
+        lost=found.lost,
+    )
 
 
 def _account(room: int, errors: Array) -> Account:
@@ -178,7 +201,7 @@ def _iterated(
     u, v = u + (found.u - start_u), v + (found.v - start_v)
     net = with_derivative(order, method.restart, found.net, (u, v), task.knots, task.tensor, task.data)
     errors = _errors(order, fixed, found.net, found.u, found.v)
-    return Solution(net, task.knots, u, v, errors, found.account, found.number, found.change, found.lost)
+    return _solution(task, net, u, v, errors, found)
 
 
 def _errors(order: tuple[int, int], task: Task, net: Array, u: Array, v: Array) -> Array:
