@@ -78,31 +78,18 @@ def test_a_closed_grid_gives_a_closed_surface():
 @pytest.mark.parametrize("order", [(4, 4), (3, 5)])
 def test_derivatives_are_those_of_finite_differences(order):
     grid = jnp.asarray(random_grid(7, 9, 3))
-    direction, cotangent = (jnp.asarray(random_grid(7, 9, 3, seed)) - 4 for seed in (1, 2))
+    direction, cotangent = (random_grid(7, 9, 3, seed) - 4 for seed in (1, 2))
 
-    @jax.jit
-    def value(t):
-        return jnp.sum(cotangent * net_of(grid + t * direction, order))
+    def value(grid):
+        fit = jf.interpolate(grid, STANDARD, order)
+        return jnp.sum(cotangent * fit.surface.control_points) + fit.average_error
 
     step = 1e-5
-    expected = (value(step) - value(-step)) / (2 * step)
-    assert abs(jax.jvp(value, (0.0,), (1.0,))[1] - expected) < 1e-6 * abs(expected)
-    assert abs(jax.grad(value)(0.0) - expected) < 1e-6 * abs(expected)
-
-
-def test_gradients_with_respect_to_the_whole_grid_are_finite_and_match_one_entry():
-    grid = jnp.asarray(GRID)
-
-    @jax.jit
-    def value(grid):
-        fit = jf.interpolate(grid, STANDARD)
-        return jnp.sum(fit.surface.control_points**3) + fit.average_error
-
-    gradient = jax.jit(jax.grad(value))(grid)
-    bump = jnp.zeros_like(grid).at[3, 4, 2].set(1e-5)
-    expected = (value(grid + bump) - value(grid - bump)) / 2e-5
-    assert bool(jnp.isfinite(gradient).all())
-    assert abs(gradient[3, 4, 2] - expected) < 1e-6 * abs(expected)
+    sides = [np.sum(cotangent * np.asarray(net_of(grid + s * direction, order))) for s in (step, -step)]
+    expected = (sides[0] - sides[1]) / (2 * step)
+    gradient = np.asarray(jax.jit(jax.grad(value))(grid))
+    assert np.isfinite(gradient).all()
+    assert abs(np.sum(gradient * direction) - expected) < 1e-6 * abs(expected)
 
 
 @pytest.mark.float32_too
@@ -177,15 +164,16 @@ def test_every_point_can_keep_its_own_parameters():
 
 
 def test_derivatives_with_a_parameter_pair_for_every_point():
-    direction, cotangent = (jnp.asarray(random_grid(9, 8, 3, seed)) / 20 for seed in (1, 2))
+    direction, cotangent = (random_grid(9, 8, 3, seed) / 20 for seed in (1, 2))
 
-    @jax.jit
-    def value(t):
-        return jnp.sum(cotangent * net_of(SHEARED + t * direction, method=PER_POINT))
+    def net(grid):
+        return net_of(grid, method=PER_POINT)
 
     step = 1e-4
-    expected = (value(step) - value(-step)) / (2 * step)
-    assert abs(jax.grad(value)(0.0) - expected) < 1e-6 * abs(expected)
+    sides = [np.sum(cotangent * np.asarray(net(SHEARED + s * direction))) for s in (step, -step)]
+    expected = (sides[0] - sides[1]) / (2 * step)
+    gradient = jax.jit(jax.grad(lambda grid: jnp.sum(cotangent * net(grid))))(jnp.asarray(SHEARED))
+    assert abs(np.sum(np.asarray(gradient) * direction) - expected) < 1e-6 * abs(expected)
 
 
 def test_a_system_without_a_solution_is_reported_and_nothing_is_nan():

@@ -59,7 +59,7 @@ def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, so
     if (np.asarray(solution.extent) <= noise).any():
         # The exact test is the parametrisation's own; no row is shorter than its longest step.
         grid_parameters(inner, method.parametrisation)
-    if not np.isfinite(solution.net).all():
+    if not np.isfinite(solution.maximum):
         raise ValueError(
             f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
             "matrix is singular to rounding; lower the order, or remove points that repeat."
@@ -75,7 +75,7 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any]
     # Corners are the data, to the last bit.
     if concrete:
         net[corner] = np.asarray(grid)[corner]
-        net = jnp.asarray(net.astype(solution.net.dtype))
+        net = jnp.asarray(net, solution.net.dtype)
     else:
         net = net.at[corner].set(grid[corner].astype(net.dtype))
     stats = {
@@ -100,7 +100,7 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any]
 
 
 def _history(account: Account) -> History:
-    if not is_concrete(account):
+    if not is_concrete(account) or account.average.shape == (1,):
         return History(account.average, account.maximum)
     end = int(account.step) + 1
     return History(*(jnp.asarray(np.asarray(x)[:end]) for x in (account.average, account.maximum)))

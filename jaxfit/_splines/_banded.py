@@ -44,14 +44,15 @@ def transposed(band: Float[Array, "n band"]) -> Float[Array, "n band"]:
     return jnp.stack([padded[k : k + count, width - 1 - k] for k in range(width)], axis=1)
 
 
-def times(band: Float[Array, "n band"], x: Float[Array, "n columns"]) -> Float[Array, "n columns"]:
-    """The matrix times `x`."""
+def times(band: Float[Array, "n band"], x: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
+    """The matrix times `x` along one axis of `x`, which has length n."""
     count, width = band.shape
     reach = (width - 1) // 2
-    padded = jnp.pad(x, ((reach, reach), (0, 0)))
+    padded = jnp.pad(x, [(reach, reach) if each == axis else (0, 0) for each in range(x.ndim)])
+    column = [count if each == axis else 1 for each in range(x.ndim)]
     total = jnp.zeros_like(x)
     for k in range(width):
-        total = total + band[:, k, None] * padded[k : k + count]
+        total = total + band[:, k].reshape(column) * lax.slice_in_dim(padded, k, k + count, axis=axis)
     return total
 
 
