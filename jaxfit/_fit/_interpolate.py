@@ -46,7 +46,8 @@ def interpolate(
     max_steps : int
         Most iterations (of `StandardInterpolation`, cycles of GMRES).
     progress : callable, optional
-        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
+        not by `StandardInterpolation`, which is done in one go.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
 

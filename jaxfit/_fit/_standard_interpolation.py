@@ -8,21 +8,23 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._closest import Newton, project
 from jaxfit._fit._collocation import (
     Account,
-    TensorCollocation,
     distances,
-    improved,
-    point_collocation,
     tensor_collocation,
     with_derivative,
 )
+from jaxfit._fit._parameter_correction import (
+    Corrected,
+    Task,
+    corrected,
+    errors_at,
+    new_account,
+    settled,
+)
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import averaging_knots
-from jaxfit._splines._pieces import make_pieces
 
-FOOT_STEPS = 40
 Pair = tuple[Array, Array]
 
 
@@ -103,28 +105,6 @@ class Solution(eqx.Module):
     lost: Array  # closest points not found to the tolerance
 
 
-class Task(eqx.Module):
-    """The data, and what all solves share."""
-
-    data: Float[Array, "n m d"]
-    knots: Pair
-    tensor: TensorCollocation
-    limits: tuple[Array, Array, Array]  # diagonal, tolerance, most cycles
-
-
-class Corrected(eqx.Module):
-    """Everything that goes round the loop of corrections."""
-
-    net: Array
-    u: Array
-    v: Array
-    account: Account
-    number: Array  # of corrections
-    change: Array
-    lost: Array
-    slow: Array
-
-
 @partial(jax.jit, static_argnames=("method", "order", "room"))
 def solved(
     method: StandardInterpolation,
@@ -151,7 +131,7 @@ def solved(
     errors = lax.stop_gradient(distances(data - tensor.times(net), limits[0]))
     zero = jnp.asarray(0, jnp.int32)
     rest = jnp.zeros((), data.dtype)
-    found = Corrected(net, u, v, _account(room, errors), zero, rest, zero, jnp.asarray(False))
+    found = Corrected(net, u, v, new_account(room, errors), zero, rest, zero, jnp.asarray(False))
     return _solution(task, net, u, v, errors, found)
 
 
@@ -170,15 +150,9 @@ def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: 
         maximum=account.maximum[account.step],
         extent=lax.stop_gradient(extent),
         corrections=found.number,
-        parameter_change=found.change,
+        parameter_change=jnp.where(found.number > 0, found.change, 0.0),
         lost=found.lost,
     )
-
-
-def _account(room: int, errors: Array) -> Account:
-    empty = jnp.full(room, jnp.nan, errors.dtype)
-    zero = jnp.asarray(0, jnp.int32)
-    return Account(zero, empty, empty).noted(zero, errors)
 
 
 def _iterated(
@@ -192,74 +166,13 @@ def _iterated(
 ) -> Solution:
     """The general system, from the net of the tensor product, and corrections of the parameters."""
     fixed, net, start_u, start_v = lax.stop_gradient((task, net, u, v))
-    errors = _errors(order, fixed, net, start_u, start_v)
-    found = _settled(method, order, fixed, net, start_u, start_v, _account(room, errors))
+    errors = errors_at(order, fixed, net, start_u, start_v)
+    found = settled(method, order, fixed, net, start_u, start_v, new_account(room, errors))
     if method.parameter_correction:
-        found = _corrections(method, order, fixed, found)
+        found = corrected(method, order, fixed, found)
     found = lax.stop_gradient(found)
     # Derivatives see the first parameters, moved by constants.
     u, v = u + (found.u - start_u), v + (found.v - start_v)
     net = with_derivative(order, method.restart, found.net, (u, v), task.knots, task.tensor, task.data)
-    errors = _errors(order, fixed, found.net, found.u, found.v)
+    errors = errors_at(order, fixed, found.net, found.u, found.v)
     return _solution(task, net, u, v, errors, found)
-
-
-def _errors(order: tuple[int, int], task: Task, net: Array, u: Array, v: Array) -> Array:
-    """Distances at the parameters."""
-    return distances(task.data - point_collocation(task.knots, order, u, v).times(net), task.limits[0])
-
-
-def _settled(
-    method: StandardInterpolation,
-    order: tuple[int, int],
-    task: Task,
-    net: Array,
-    u: Array,
-    v: Array,
-    account: Account,
-) -> Corrected:
-    """The system at these parameters, solved as well as it can be."""
-    system = point_collocation(task.knots, order, u, v)
-    net, account = improved(
-        system, task.tensor.factorised(), task.data, net, account, task.limits, method.restart
-    )
-    zero = jnp.asarray(0, jnp.int32)
-    far = jnp.asarray(jnp.inf, net.dtype)
-    return Corrected(net, u, v, account, zero, far, zero, jnp.asarray(False))
-
-
-def _corrections(
-    method: StandardInterpolation, order: tuple[int, int], task: Task, found: Corrected
-) -> Corrected:
-    """Closest points and a new solve in turn, until the parameters rest, or neither they nor the errors
-    come down any more."""
-    n, m, d = task.data.shape
-    diagonal, _, most = task.limits
-    target = task.data.reshape(n * m, d).T
-    still = 100 * float(jnp.finfo(target.dtype).eps)
-
-    def goes_on(now: Corrected) -> Array:
-        left = (now.number < method.max_corrections) & (now.account.step < most)
-        return left & (now.change > still) & ~now.slow
-
-    def correct(now: Corrected) -> Corrected:
-        pieces = make_pieces(now.net, *task.knots)
-        feet = project(
-            Newton(),
-            pieces,
-            target,
-            now.u.reshape(-1),
-            now.v.reshape(-1),
-            method.foot_tolerance * diagonal,
-            jnp.asarray(FOOT_STEPS, jnp.int32),
-        )
-        u, v = feet.best_u.reshape(n, m), feet.best_v.reshape(n, m)
-        change = jnp.maximum(jnp.max(jnp.abs(u - now.u)), jnp.max(jnp.abs(v - now.v)))
-        account = now.account.noted(now.account.step, _errors(order, task, now.net, u, v))
-        new = _settled(method, order, task, now.net, u, v, account)
-        step, before = new.account.step, now.account.maximum[now.account.step]
-        slow = (change > 0.9 * now.change) & (new.account.maximum[step] > 0.9 * before)
-        lost = jnp.sum(~feet.converged, dtype=jnp.int32)
-        return Corrected(new.net, u, v, new.account, now.number + 1, change, lost, slow)
-
-    return lax.while_loop(goes_on, correct, found)
