@@ -8,7 +8,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest import Newton, project
-from jaxfit._fit._collocation import (
+from jaxfit._fit._grid_systems import (
     Account,
     TensorCollocation,
     distances,

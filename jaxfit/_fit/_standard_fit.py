@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._collocation import Account
 from jaxfit._fit._fit_result import Fit, History, sentence_of
+from jaxfit._fit._grid_systems import Account
 from jaxfit._fit._loop import code_of, result_of
 from jaxfit._fit._problem import Unit, unit_of
 from jaxfit._fit._results import RESULTS

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._fit._collocation import (
+from jaxfit._fit._grid_systems import (
     Account,
     distances,
     tensor_collocation,
