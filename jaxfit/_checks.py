@@ -1,5 +1,6 @@
 """Checks of what users hand in: one sentence each, before anything is compiled."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -35,6 +36,25 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     if is_concrete(array) and array.size:
         check_finite(name, array)
     return array
+
+
+def as_vector(name: str, x: ArrayLike | Sequence[float | int], dimension: int | None = None) -> Any:
+    """`x` as a floating vector (d,), of `dimension` coordinates where that is given."""
+    entries: Any = np.asarray(x) if isinstance(x, (list, tuple)) else x
+    vector = as_floating(name, entries, 1)
+    if dimension is not None and vector.shape != (dimension,):
+        raise ValueError(
+            f"{name} must have {dimension} coordinates, but has shape {vector.shape}; give a vector."
+        )
+    return vector
+
+
+def as_direction(name: str, x: ArrayLike | Sequence[float | int], dimension: int | None = None) -> Any:
+    """`as_vector`, not zero where it is concrete."""
+    vector = as_vector(name, x, dimension)
+    if is_concrete(vector) and not np.any(vector):
+        raise ValueError(f"{name} must not be zero, since it then has no direction; give a vector.")
+    return vector
 
 
 def check_finite(name: str, x: ArrayLike) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxfit import BSplineCurve, BSplineSurface, HuWallner, PointStatus, closest_point
+from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
 
 COUNT = 512  # one size for nearly all queries: few compilations
 
@@ -188,6 +188,27 @@ def test_feet_reach_the_working_precision():
     assert feet.distance.dtype == points.dtype
     expected = closest_reference.nearest_distance(surface, np.asarray(points))
     assert np.max(np.asarray(feet.distance) - expected) <= 50 * helpers.eps()
+
+
+@pytest.mark.parametrize("method", [Newton(), HuWallner()])
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-6])
+def test_residuals_at_feet_are_orthogonal_to_the_tolerance(method, tolerance):
+    rng = np.random.default_rng(1)
+    net = helpers.wavy_net(12, 11)
+    net[..., 2] += rng.normal(scale=0.15, size=(12, 11))
+    surface = BSplineSurface(net, helpers.clamped_uniform(12, 3), helpers.clamped_uniform(11, 5))
+    points = rng.uniform((-0.3, -0.3, -0.2), (1.3, 1.3, 0.6), (2000, 3))
+    feet = closest_point(surface, points, method=method, tolerance=tolerance)
+    assert feet.converged.all()
+    inner = np.asarray(feet.status) == PointStatus.INTERIOR
+    assert inner.sum() > 500
+    away = points - np.asarray(feet.point)
+    size = helpers.diagonal(np.concatenate([points, net.reshape(-1, 3)]))
+    for order in ((1, 0), (0, 1)):
+        tangent = np.asarray(surface.derivative(feet.u, feet.v, *order))
+        part = np.sum(away * tangent, axis=1) / np.linalg.norm(tangent, axis=1)
+        # Now and then what was foreseen is a little short.
+        assert np.abs(part[inner]).max() <= 3 * tolerance * size
 
 
 @pytest.mark.float32_too

@@ -1,14 +1,27 @@
-"""Plain geometric interpolation: it passes through the grid, and says so only when it does."""
+"""Geometric interpolation: it passes through the grid, and says so only when it does."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import count_compilations, data, diagonal, eps, wavy_grid
+from scipy.interpolate import BSpline
 
 import jaxfit as jf
 
 GRID = wavy_grid(8, 7)
+PLAIN = jf.GeometricInterpolation(repositioning=jf.UnitWeights(), freeze_after=None)
+METHODS = {
+    "both accelerations": jf.GeometricInterpolation(),
+    "plain": PLAIN,
+    "frozen feet": jf.GeometricInterpolation(repositioning=jf.UnitWeights()),
+    "optimal repositioning": jf.GeometricInterpolation(freeze_after=None),
+    "constant weight": jf.GeometricInterpolation(repositioning=jf.ConstantWeight(), freeze_after=None),
+    "Chebyshev": jf.GeometricInterpolation(
+        repositioning=jf.UnitWeights(), acceleration=jf.Chebyshev(), freeze_after=1
+    ),
+    "local": jf.GeometricInterpolation(local=True),
+}
 
 
 def tube(n, m):
@@ -38,8 +51,67 @@ def test_corners_are_the_data_to_the_last_bit():
         assert (net[i, j] == (GRID + 0.1)[i, j]).all()
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_meets_the_data(name):
+    fit = jf.interpolate(GRID, METHODS[name])
+    assert bool(fit.converged), fit.message
+    there = np.asarray(fit.surface(fit.u, fit.v))
+    assert np.linalg.norm(there - GRID, axis=-1).max() <= 1.1e-12 * diagonal(GRID)
+
+
+def test_accelerations_take_fewer_iterations_and_evaluations():
+    steps, evaluations = {}, {}
+    for name in ("plain", "frozen feet", "optimal repositioning", "both accelerations", "Chebyshev"):
+        fit = jf.interpolate(GRID, METHODS[name])
+        steps[name] = int(fit.stats["num_steps"])
+        evaluations[name] = float(fit.history.evaluations.sum())
+    assert steps["optimal repositioning"] < 0.8 * steps["plain"]
+    assert steps["both accelerations"] < 0.8 * steps["plain"]
+    assert steps["Chebyshev"] < 0.6 * steps["both accelerations"]
+    assert evaluations["frozen feet"] < 0.2 * evaluations["plain"]
+    assert evaluations["both accelerations"] < 0.2 * evaluations["plain"]
+
+
+def test_weights_are_equation_27():
+    fit = jf.interpolate(GRID, jf.GeometricInterpolation(freeze_after=None), max_steps=1)
+    first = jf.interpolate(GRID, PLAIN, max_steps=0)
+    i, j, u, v = 3, 2, float(first.u[3, 2]), float(first.v[3, 2])
+    ku, kv = np.asarray(first.surface.knots_u), np.asarray(first.surface.knots_v)
+    nu, nv = BSpline(ku, np.eye(8), 3)(u), BSpline(kv, np.eye(7), 3)(v)
+    error = GRID[i, j] - np.asarray(first.surface(u, v))
+    weight = nu[i] * nv[j] / (np.sum(nu**2) * np.sum(nv**2))
+    expected = GRID[i, j] + weight * error
+    np.testing.assert_allclose(np.asarray(fit.surface.control_points)[i, j], expected, atol=1e-13)
+
+
+def test_the_constant_weight_is_equation_17():
+    fit = jf.interpolate(GRID, METHODS["constant weight"], max_steps=1)
+    first = jf.interpolate(GRID, PLAIN, max_steps=0)
+    lowest = 1.0
+    parameters = jf.grid_parameters(GRID)
+    for t, knots in zip(parameters[:2], (first.surface.knots_u, first.surface.knots_v), strict=True):
+        matrix = BSpline(np.asarray(knots), np.eye(len(t)), 3)(np.asarray(t))
+        lowest *= np.linalg.eigvals(matrix).real.min()
+    error = GRID - np.asarray(first.surface(first.u, first.v))
+    moved = np.asarray(fit.surface.control_points) - GRID
+    np.testing.assert_allclose(moved[2:-2, 2:-2], 2 / (1 + lowest) * error[2:-2, 2:-2], rtol=1e-3, atol=1e-13)
+
+
+def test_feet_outside_the_stencil_are_met_all_the_same():
+    # Rows with very different spacing: averaged knots leave feet far from their control points.
+    x = np.linspace(0, 1, 12)
+    grid = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((12, 12))], axis=-1)
+    for j in range(12):
+        grid[:, j, 0] = x ** (0.35 if j % 2 else 2.5)
+    fit = jf.interpolate(grid, max_steps=400)
+    assert np.isfinite(np.asarray(fit.surface.control_points)).all()
+    assert bool(fit.converged) == (float(fit.maximum_error) <= 1e-12)
+    at = np.asarray(fit.surface(fit.u, fit.v))
+    np.testing.assert_allclose(np.linalg.norm(at - grid, axis=-1) / diagonal(grid), fit.errors, atol=1e-12)
+
+
 def test_one_step_is_equations_13_and_14():
-    fit = jf.interpolate(GRID, max_steps=1)
+    fit = jf.interpolate(GRID, PLAIN, max_steps=1)
     parameters = jf.grid_parameters(GRID)
     knots = [jf.averaging_knots(t, 4) for t in parameters[:2]]
     first = jf.BSplineSurface(GRID, *knots)

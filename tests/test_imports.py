@@ -18,7 +18,7 @@ ROOMS = [
     ("_cells",),
     ("_closest",),
     ("_base",),
-    ("_fit",),
+    ("_fit", "_quality"),
     ("io",),
     ("plot",),
     ("_cli_arguments", "_cli_report"),

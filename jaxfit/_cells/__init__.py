@@ -7,6 +7,7 @@ from jaxfit._cells._layout import values_at as values_at
 from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
+from jaxfit._cells._polynomials import horner as horner
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows
 from jaxfit._cells._rows import row_width as row_width

@@ -10,15 +10,18 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import evaluate_jet, staged
-from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
+from jaxfit._closest._steps import AbstractFootMethod, Forms, Newton, measure
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 2.0  # in local coordinates: a cell
 # In units of a cell's half width: where its polynomial is the surface, and where it still leads on.
 INSIDE, NEAR = 1.0 + 1e-6, 2.0
 LED_ON = 8  # evaluations; a foot that takes longer may be going round in circles across a knot
-# The error foreseen after a step may be this share of the tolerance, for the foot to count as found.
-FORESIGHT = 0.1
+# The error foreseen after a step may be this share of the tolerance, for the foot to count as found; so small
+# a share because only the order of magnitude is foreseen.
+FORESIGHT = 0.01
+# After this many evaluations a method that converges linearly gives way to Newton's.
+PATIENCE = 30
 
 GOING, ARRIVED, GIVEN_UP = 0, 1, 2
 UNJUDGED = -1  # in place of the number of halvings: the trial comes from a continued polynomial
@@ -159,7 +162,7 @@ def advance(
     u, v, best_u, best_v, best = feet.real
     halvings, steps, _ = feet.whole
     first = _measure_at(method, always, u, v, target, coefficients, box)
-    next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, box, limits)
+    next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, steps > PATIENCE, box, limits)
     off = jnp.maximum(jnp.abs(u - box.centre_u) * box.rate_u, jnp.abs(v - box.centre_v) * box.rate_v)
     going = is_going(feet, limits)
     judged = going & (off <= INSIDE)
@@ -168,7 +171,7 @@ def advance(
     accepted = first.f <= best + limits.slack(first.f)
     still = (next_u == u) & (next_v == v)
     # What is foreseen rests on the last two steps, so both must have been judged.
-    certain = still | (foreseen & (halvings == 0))
+    certain = still | (foreseen & (halvings == 0) & method.quadratic)
     back_u, back_v = 0.5 * (u + best_u), 0.5 * (v + best_v)
     spent = (halvings >= MOST_HALVINGS) | ((back_u == best_u) & (back_v == best_v))
     moves = led_on | (judged & accepted)
@@ -212,6 +215,7 @@ def _next_trial(
     u: Array,
     v: Array,
     best: Array,
+    late: Array,
     box: Box,
     limits: Limits,
 ) -> tuple[Array, Array, Array, Array]:
@@ -223,6 +227,9 @@ def _next_trial(
     always = limits.tolerance < jnp.inf
     pinned_s, pinned_t, settled = _pins(first, u, v, box, limits.tolerance)
     ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
+    if not method.quadratic:
+        newton_s, newton_t = staged(always, Newton().step, first, pinned_s, pinned_t)
+        ds, dt = jnp.where(late, newton_s, ds), jnp.where(late, newton_t, dt)
     ds, dt = staged(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
     return staged(always, _foresee, first, u, v, ds, dt, best, box, limits)
 
@@ -230,20 +237,30 @@ def _next_trial(
 def _foresee(
     first: Forms, u: Array, v: Array, ds: Array, dt: Array, best: Array, box: Box, limits: Limits
 ) -> tuple[Array, Array, Array, Array]:
-    free_u, free_v = u + ds * box.half_u, v + dt * box.half_v
-    next_u, next_v = jnp.clip(free_u, box.low_u, box.high_u), jnp.clip(free_v, box.low_v, box.high_v)
-    # Half the fall to come, |step|^2 in the metric of the Hessian; and the last step's fall.
+    next_u = _landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
+    next_v = _landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+    # |step|^2 in the metric of the Hessian is half the fall of f to come, and was half its last fall.
     fall = first.gradient_s * ds + first.gradient_t * dt
     before = jnp.where(best < jnp.inf, best - first.f, 0.0)
-    # Quadratic convergence: steps of length a, then b, are followed by one of b (b / a^2) b.
-    share = FORESIGHT * limits.tolerance
-    foreseen = (before > 0) & (fall >= 0) & (fall * fall * fall <= (share * before) ** 2)
+    # Quadratic convergence: steps of length a, then b, are followed by one of b (b / a^2) b. A residual is
+    # longer than its step where the Hessian is larger than the first form.
+    a, b, c = first.E - first.e_ss, first.F - first.e_st, first.G - first.e_tt
+    share = (FORESIGHT * limits.tolerance * before) ** 2
+    foreseen = (fall**3 * a <= share * first.E) & (fall**3 * c <= share * first.G)
+    foreseen &= (before > 0) & (fall >= 0) & (a > 0) & (a * c > b * b)
     # The distance is foreseen as well as the foot where it is longer than the step.
     foreseen &= fall <= first.f - fall
-    at_s, at_t = (free_u - box.centre_u) * box.rate_u, (free_v - box.centre_v) * box.rate_v
-    foreseen &= (next_u == free_u) & (next_v == free_v)
+    # On a bound or in another cell it is not the same polynomial that decides.
+    foreseen &= (next_u > box.low_u) & (next_u < box.high_u) & (next_v > box.low_v) & (next_v < box.high_v)
+    at_s, at_t = (next_u - box.centre_u) * box.rate_u, (next_v - box.centre_v) * box.rate_v
     foreseen &= (jnp.abs(at_s) <= INSIDE) & (jnp.abs(at_t) <= INSIDE)
     return next_u, next_v, jnp.maximum(first.f - fall, 0.0), foreseen
+
+
+def _landing(u: Array, ds: Array, low: Array, high: Array, half: Array, rate: Array) -> Array:
+    """Where a step ends; one cut off at a bound ends on the bound to the last bit."""
+    free = jnp.clip(u + ds * half, low, high)
+    return jnp.where(ds <= (low - u) * rate, low, jnp.where(ds >= (high - u) * rate, high, free))
 
 
 def _downhill(

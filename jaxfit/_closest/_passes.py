@@ -16,7 +16,8 @@ from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
 STEPS_PER_PASS = 4
-SLOTS_PER_BLOCK = 32768
+SLOTS_PER_BLOCK = 32768  # what a block computes stays in the caches
+SINGLES_PER_BLOCK = 4096  # the same for rows of one point, each with a polynomial of its own
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096
 SHARED_FROM_FILL = 2
@@ -69,7 +70,7 @@ def _pass(
 ) -> Feet:
     """A few steps for every foot in a row."""
     count, width = rows.point.shape
-    size = min(count, max(1, SLOTS_PER_BLOCK // width))
+    size = min(count, SLOTS_PER_BLOCK // width if width > 1 else SINGLES_PER_BLOCK)
 
     def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         start, feet = carry

@@ -65,6 +65,7 @@ class AbstractFootMethod(eqx.Module):
     """How a foot point moves, given the inner products at it."""
 
     drift: AbstractClassVar[bool]  # whether `step` needs Forms.drift
+    quadratic: AbstractClassVar[bool]  # whether steps shrink quadratically at a foot
 
     @abstractmethod
     def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
@@ -79,6 +80,7 @@ class Newton(AbstractFootMethod):
     """
 
     drift: ClassVar[bool] = False
+    quadratic: ClassVar[bool] = True
 
     def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
         """Solve the 2x2 system with the Hessian, made positive where it is not."""
@@ -109,6 +111,7 @@ class HuWallner(AbstractFootMethod):
     """
 
     drift: ClassVar[bool] = True
+    quadratic: ClassVar[bool] = False
 
     def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""

@@ -4,8 +4,13 @@ from jaxfit._fit._approximate import approximate as approximate
 from jaxfit._fit._approximate import fit_points as fit_points
 from jaxfit._fit._fit_result import Fit as Fit
 from jaxfit._fit._fit_result import History as History
+from jaxfit._fit._frozen import Chebyshev as Chebyshev
+from jaxfit._fit._frozen import Richardson as Richardson
 from jaxfit._fit._geometric_approximation import GeometricApproximation as GeometricApproximation
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit._interpolate import interpolate as interpolate
+from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight
+from jaxfit._fit._repositioning import OptimalRepositioning as OptimalRepositioning
+from jaxfit._fit._repositioning import UnitWeights as UnitWeights
 from jaxfit._fit._results import RESULTS as RESULTS
 from jaxfit._fit._standard_interpolation import StandardInterpolation as StandardInterpolation

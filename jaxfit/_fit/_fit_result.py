@@ -15,7 +15,11 @@ from jaxfit._splines import BSplineSurface
 
 
 class History(eqx.Module):
-    """Errors on the surface of every iteration, the first one included; fractions of the diagonal.
+    """What happened in every iteration, the first surface included.
+
+    `average` and `maximum` are errors as fractions of the diagonal: at closest points, or at frozen ones
+    while a method holds them. `evaluations` of the surface were made for a foot, and its parameters (u plus
+    v) moved by `change`, both on average over the points.
 
     Inside a transformation, where the number of iterations is not known, the arrays have room for more
     and end in NaN.
@@ -23,6 +27,8 @@ class History(eqx.Module):
 
     average: Float[Array, " steps"]
     maximum: Float[Array, " steps"]
+    evaluations: Float[Array, " steps"]
+    change: Float[Array, " steps"]
 
 
 class Fit(eqx.Module):
@@ -38,7 +44,7 @@ class Fit(eqx.Module):
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
-        Average and maximum error of every iteration.
+        Errors, evaluations and parameter changes of every iteration.
     result : item of RESULTS
         Why the fit stopped; `converged` and `message` say it as a boolean and as a sentence.
     stats : dict
@@ -78,9 +84,8 @@ def history_of(carry: Carry) -> History:
     if is_concrete(carry):
         end = int(carry.step) + 1
         # Cut by NumPy: by JAX, every new length would be a new compilation.
-        cut = (jax.device_put(np.asarray(x)[:end]) for x in (carry.average, carry.maximum))
-        return History(*cut)
-    return History(carry.average, carry.maximum)
+        return History(*(jax.device_put(np.asarray(x)[:end]) for x in jax.tree.leaves(carry.next.records)))
+    return History(*jax.tree.leaves(carry.next.records))
 
 
 def outcome(carry: Carry, throw: bool) -> Any:

@@ -15,7 +15,7 @@ from jaxfit._cells import (
     staged,
 )
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Measured
+from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border, measure_feet
 from jaxfit._splines._pieces import Pieces
 
@@ -51,8 +51,9 @@ class GeometricApproximation(AbstractIterativeMethod):
     stall_window: int = 40
     stall_gain: float = 2e-3
 
-    def move(self, problem: Any, net: Array, pieces: Pieces, measured: Measured) -> Array:
+    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
         """One step of Algorithm 1 from converged feet."""
+        net = turn.net
         width = row_width(measured.u.shape[0], pieces.cells)
         rows = rows_of(pieces, measured.u, measured.v, width, problem.weight <= 0)
 
@@ -70,7 +71,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         touched = weight > 0
         shift = jnp.where(touched, sums[..., :-1] / jnp.where(touched, weight, 1.0), 0.0)
         held = border(net.shape[0], net.shape[1], corners_only=not self.fixed_boundary)
-        return jnp.where(held[..., None], net, net + shift)
+        return Turn(jnp.where(held[..., None], net, net + shift), turn.step + 1, turn.records)
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Feet from the last ones, converged on the new surface."""

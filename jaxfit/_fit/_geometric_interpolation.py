@@ -1,14 +1,15 @@
-"""Geometric interpolation of grids: section 3 of the paper, plain."""
+"""Geometric interpolation of grids: section 3 of the paper."""
 
 from typing import Any
 
 import jax.numpy as jnp
-from jax import Array
 
-from jaxfit._cells import values_at
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Measured
+from jaxfit._fit._collocation import windows_at
+from jaxfit._fit._frozen import AbstractAcceleration, Richardson, System, iterate_frozen
+from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border, measure_feet
+from jaxfit._fit._repositioning import AbstractRepositioning, OptimalRepositioning
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines._pieces import Pieces
 
@@ -19,16 +20,32 @@ class GeometricInterpolation(AbstractIterativeMethod):
     The control net starts as the data (12). In every iteration the closest point of each $Q_{ij}$ on the
     surface is found, warm-started, and with $e_{ij} = Q_{ij} - R(\hat u_{ij}, \hat v_{ij})$ (13)
 
-    $$P_{ij} \leftarrow P_{ij} + e_{ij} \quad (14)$$
+    $$P_{ij} \leftarrow P_{ij} + w_{ij} e_{ij} \quad (14)$$
 
-    except at the four corners, which the surface interpolates from the start. The slowest errors fall by a
-    factor of about 0.92 an iteration, so 1e-12 of the diagonal takes some 200.
+    except at the four corners, which the surface interpolates from the start. After a few iterations the feet
+    hardly move; they are then frozen (section 3.3.1), which makes an iteration a fixed stencil on the net,
+    until the errors there meet the tolerance. New closest points then give the exact errors, and if these do
+    not meet it, the iteration resumes from them.
+
+    Plain, as in (12)-(14), it is `GeometricInterpolation(repositioning=UnitWeights(), freeze_after=None)`:
+    the slowest errors then fall by a factor of about 0.92 an iteration, so 1e-12 of the diagonal takes some
+    200.
 
     Parameters
     ----------
     parametrisation : ChordLength() or Centripetal()
         Of the grid's rows and columns; its averages give knots (5) and first feet. Centripetal is better
         where the data takes sharp turns.
+    repositioning : OptimalRepositioning(), ConstantWeight() or UnitWeights()
+        The weights w: equation (27), Lu's (17), or 1.
+    freeze_after : int or None
+        Iterations with moving feet before they are held; None never holds them.
+    acceleration : Richardson() or Chebyshev()
+        How moves with frozen feet are made: as they are, or by Chebyshev's semi-iteration, which takes about
+        half as many.
+    local : bool
+        Move only control points whose data point still misses the tolerance on the maximum error (Maekawa et
+        al., 2007).
     foot_method : Newton() or HuWallner()
         How feet are brought up to date (default Newton).
     foot_tolerance : float
@@ -39,16 +56,34 @@ class GeometricInterpolation(AbstractIterativeMethod):
     """
 
     parametrisation: AbstractParametrisation = ChordLength()
+    repositioning: AbstractRepositioning = OptimalRepositioning()
+    freeze_after: int | None = 2
+    acceleration: AbstractAcceleration = Richardson()
+    local: bool = False
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-13
     stall_window: int = 40
     stall_gain: float = 0.1
 
-    def move(self, problem: Any, net: Array, pieces: Pieces, measured: Measured) -> Array:
-        """Equations (13) and (14) from converged feet."""
-        error = problem.target - values_at(pieces, measured.u, measured.v)
-        held = border(net.shape[0], net.shape[1], corners_only=True)
-        return jnp.where(held[..., None], net, net + error.T.reshape(net.shape))
+    @property
+    def needs_spectrum(self) -> bool:
+        """Whether the smallest eigenvalue of the collocation matrix plays a part."""
+        return self.repositioning.needs_spectrum or self.acceleration.needs_spectrum
+
+    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
+        """Equations (13) and (14) once, or as often as the frozen feet allow."""
+        nu, nv, _ = turn.net.shape
+        target = problem.target.reshape(-1, nu, nv)
+        windows = windows_at(pieces, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
+        held = border(nu, nv, corners_only=True)
+        lowest = jnp.ones_like(problem.diagonal) if problem.lowest is None else problem.lowest
+        weight = self.repositioning.weights(windows, lowest)
+        system = System(windows, target, weight, held, lowest, problem.diagonal)
+        if self.freeze_after is None:
+            most = jnp.ones_like(turn.step)
+        else:
+            most = jnp.where(turn.step < self.freeze_after, 1, limits.max_steps)
+        return iterate_frozen(self, limits, system, most, turn)
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Closest points from the last ones."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -13,6 +14,7 @@ from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._loop import Limits, begin, run
 from jaxfit._fit._measure import border
 from jaxfit._fit._problem import make_problem, unit_of
+from jaxfit._fit._repositioning import lowest_eigenvalue
 from jaxfit._fit._standard_fit import standard_fit
 from jaxfit._fit._standard_interpolation import StandardInterpolation
 from jaxfit._parameters import grid_parameters
@@ -91,6 +93,10 @@ def interpolate(
     cloud = data.reshape(-1, d)
     problem = make_problem(cloud, None, surface, unit, method.foot_tolerance, padded=False)
     dtype = problem.target.dtype
+    if method.needs_spectrum:
+        averaged = (parameters.u.astype(dtype), parameters.v.astype(dtype))
+        lowest = lowest_eigenvalue((problem.axis_u, problem.axis_v), averaged)
+        problem = eqx.tree_at(lambda p: p.lowest, problem, lowest, is_leaf=lambda x: x is None)
     u = jnp.repeat(parameters.u.astype(dtype), m)
     v = jnp.tile(parameters.v.astype(dtype), n)
     limits = Limits(
@@ -111,7 +117,7 @@ def _finished(carry: Any, problem: Any, unit: Any, grid: Any, surface: BSplineSu
     points = jnp.asarray(points)
     corners = border(points.shape[0], points.shape[1], corners_only=True)[..., None]
     points = jnp.where(corners, jnp.asarray(grid, points.dtype), points)
-    average, maximum = problem.summarise(measured.error)
+    average, maximum, _, _ = problem.summarise(measured, measured)
     return Fit(
         surface=BSplineSurface(points, surface.knots_u, surface.knots_v),
         u=measured.u.reshape(n, m),

@@ -44,18 +44,41 @@ class Limits(eqx.Module):
     max_steps: Int[Array, ""]
 
 
-class Carry(eqx.Module):
-    """Everything that goes round the loop. `step` is -1 before the first measurement.
+class Records(eqx.Module):
+    """One entry for each iteration; NaN where there has been none."""
 
-    `net` is the one that has been measured, `following` the one the method makes of it.
-    """
-
-    step: Int[Array, ""]
-    net: Float[Array, "nu nv d"]
-    following: Float[Array, "nu nv d"]
-    measured: Measured
     average: Float[Array, " steps"]
     maximum: Float[Array, " steps"]
+    evaluations: Float[Array, " steps"]  # of the surface for one foot, on average
+    change: Float[Array, " steps"]  # of the feet's parameters since the iteration before, on average
+
+    def at(self, step: Array, *values: Array | float) -> "Records":
+        """With the values (average, maximum, evaluations, change) of one iteration."""
+        columns = (self.average, self.maximum, self.evaluations, self.change)
+        return Records(*(x.at[step].set(value) for x, value in zip(columns, values, strict=True)))
+
+    def is_stalled(self, step: Array, window: int, gain: float) -> Array:
+        """Whether neither error has fallen by the share `gain` within `window` iterations."""
+        before, keep = jnp.maximum(step - window, 0), 1.0 - gain
+        slow = self.average[step] > keep * self.average[before]
+        return slow & (self.maximum[step] > keep * self.maximum[before]) & (step >= window)
+
+
+class Turn(eqx.Module):
+    """A net, how many moves it took to get there, and what has been recorded on the way."""
+
+    net: Float[Array, "nu nv d"]
+    step: Int[Array, ""]
+    records: Records
+
+
+class Carry(eqx.Module):
+    """What goes round the loop: `net` has been measured, after `step` moves; `next` has not."""
+
+    net: Float[Array, "nu nv d"]
+    step: Int[Array, ""]
+    next: Turn
+    measured: Measured
     code: Int[Array, ""]
 
 
@@ -70,17 +93,18 @@ class AbstractIterativeMethod(eqx.Module):
         """Feet on a surface, warm-started from the last ones, and the errors there."""
 
     @abstractmethod
-    def move(self, problem: Any, net: Array, pieces: Pieces, measured: Measured) -> Array:
-        """The next control net, from one that has been measured and its pieces."""
+    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
+        """One or several moves from a net that has been measured, given its pieces."""
 
 
 def begin(net: Array, u: Array, v: Array, most: int) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries."""
     none = jnp.zeros(u.shape, jnp.int32)
     measured = Measured(u, v, jnp.zeros_like(u), none, none > 0)
-    history = jnp.full(bucket(most + 1), jnp.nan, net.dtype)
+    empty = jnp.full(bucket(most + 1), jnp.nan, net.dtype)
     running = jnp.asarray(code_of(RESULTS.running), jnp.int32)
-    return Carry(jnp.asarray(-1, jnp.int32), net, net, measured, history, history, running)
+    turn = Turn(net, jnp.asarray(0, jnp.int32), Records(empty, empty, empty, empty))
+    return Carry(net, jnp.asarray(-1, jnp.int32), turn, measured, running)
 
 
 def code_of(result: Any) -> int:
@@ -105,48 +129,39 @@ def advance(
     running = code_of(RESULTS.running)
 
     def body(carry: Carry) -> Carry:
-        net = carry.following
-        pieces = pieces_on(net, problem.axis_u, problem.axis_v)
+        turn = carry.next
+        pieces = pieces_on(turn.net, problem.axis_u, problem.axis_v)
         measured = method.measure(problem, pieces, carry.measured)
-        average, maximum = problem.summarise(measured.error)
-        following = method.move(problem, net, pieces, measured)
-        return _judge(method, limits, carry, (net, following), measured, average, maximum)
+        records = turn.records.at(turn.step, *problem.summarise(measured, carry.measured))
+        turn = Turn(turn.net, turn.step, records)
+        code = _judge(method, limits, turn)
+        move = partial(method.move, problem, limits, pieces, measured)
+        following = lax.cond(code == running, move, lambda turn: turn, turn)
+        good = Carry(turn.net, turn.step, following, measured, code)
+        # A step into nonsense is taken back, and leaves no trace.
+        back = eqx.tree_at(lambda c: c.code, carry, code)
+        bad = (code == code_of(RESULTS.diverged)) & (carry.step >= 0)
+        return jax.tree.map(lambda a, b: jnp.where(bad, a, b), back, good)
 
-    return lax.while_loop(lambda c: (c.code == running) & (c.step < until), body, carry)
+    return lax.while_loop(lambda c: (c.code == running) & (c.next.step <= until), body, carry)
 
 
-def _judge(
-    method: AbstractIterativeMethod,
-    limits: Limits,
-    carry: Carry,
-    nets: tuple[Array, Array],
-    measured: Measured,
-    average: Array,
-    maximum: Array,
-) -> Carry:
-    """Record a measurement, and decide whether the loop goes on."""
-    step = carry.step + 1
-    averages, maxima = carry.average.at[step].set(average), carry.maximum.at[step].set(maximum)
-    finite = jnp.isfinite(average) & jnp.isfinite(maximum) & jnp.all(jnp.isfinite(nets[0]))
-    bad = ~finite | (average > GROWTH * averages[0])
+def _judge(method: AbstractIterativeMethod, limits: Limits, turn: Turn) -> Array:
+    """Whether a net that has just been measured ends the loop, as the code of one of RESULTS."""
+    step, records = turn.step, turn.records
+    average, maximum = records.average[step], records.maximum[step]
+    finite = jnp.isfinite(average) & jnp.isfinite(maximum) & jnp.all(jnp.isfinite(turn.net))
     met = (average <= limits.average) & (maximum <= limits.maximum)
-    before = jnp.maximum(step - method.stall_window, 0)
-    keep = 1.0 - method.stall_gain
-    slow = (average > keep * averages[before]) & (maximum > keep * maxima[before])
-    slow &= step >= method.stall_window
     outcomes = (
-        (bad, RESULTS.diverged),
+        (~finite | (average > GROWTH * records.average[0]), RESULTS.diverged),
         (met, RESULTS.converged),
-        (slow, RESULTS.stalled),
+        (records.is_stalled(step, method.stall_window, method.stall_gain), RESULTS.stalled),
         (step >= limits.max_steps, RESULTS.max_steps_reached),
     )
     code = jnp.asarray(code_of(RESULTS.running), jnp.int32)
     for holds, result in reversed(outcomes):
         code = jnp.where(holds, code_of(result), code)
-    # A step into nonsense is taken back, and leaves no trace in the history either.
-    good = Carry(step, *nets, measured, averages, maxima, code)
-    taken_back = eqx.tree_at(lambda c: c.code, carry, code)
-    return jax.tree.map(lambda a, b: jnp.where(bad & (carry.step >= 0), a, b), taken_back, good)
+    return code
 
 
 @jax.custom_jvp
@@ -184,11 +199,12 @@ def run(
     chunk = FIRST_CHUNK
     while int(carry.code) == code_of(RESULTS.running):
         begun = time.perf_counter()
-        until = jnp.asarray(min(int(carry.step) + chunk, most), jnp.int32)
+        until = jnp.asarray(min(int(carry.next.step) + chunk, most), jnp.int32)
         carry = advance(method, problem, limits, until, carry)
         seconds = time.perf_counter() - begun
         step = int(carry.step)
         if step >= 0:
-            progress(step, most, float(carry.average[step]), float(carry.maximum[step]))
+            records = carry.next.records
+            progress(step, most, float(records.average[step]), float(records.maximum[step]))
         chunk = max(1, min(2 * chunk, int(chunk * REPORT_SECONDS / max(seconds, 1e-6))))
     return carry

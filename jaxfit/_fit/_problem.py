@@ -24,11 +24,18 @@ class Problem(eqx.Module):
     padding: Float[Array, " points"]  # 1 for a point, 0 for what only fills up the size
     diagonal: Float[Array, ""]
     foot_tolerance: Float[Array, ""]
+    lowest: Float[Array, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
 
-    def summarise(self, error: Float[Array, " points"]) -> tuple[Array, Array]:
-        """Average and maximum error of the true points, as fractions of the diagonal."""
-        error = jnp.where(self.padding > 0, error, 0.0) / self.diagonal
-        return jnp.sum(error) / jnp.sum(self.padding), jnp.max(error)
+    def summarise(self, measured: Any, before: Any) -> tuple[Array, Array, Array, Array]:
+        """Of the true points: average and maximum error as fractions of the diagonal, then averages of the
+        evaluations for a foot and of its change of parameters.
+        """
+        change = jnp.abs(measured.u - before.u) + jnp.abs(measured.v - before.v)
+        evaluations = measured.steps.astype(change.dtype)
+        rows = jnp.stack([measured.error / self.diagonal, evaluations, change])
+        rows = jnp.where((self.padding > 0)[None], rows, 0.0)
+        average, evaluations, change = jnp.sum(rows, axis=1) / jnp.sum(self.padding)
+        return average, jnp.max(rows[0]), evaluations, change
 
 
 class Unit(eqx.Module):

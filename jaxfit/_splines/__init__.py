@@ -17,4 +17,5 @@ from jaxfit._splines._knots import merge_knots as merge_knots
 from jaxfit._splines._knots import missing_knots as missing_knots
 from jaxfit._splines._pieces import Pieces as Pieces
 from jaxfit._splines._pieces import make_pieces as make_pieces
+from jaxfit._splines._reflection import Reflection as Reflection
 from jaxfit._splines._surface import BSplineSurface as BSplineSurface

@@ -74,8 +74,8 @@ class Axis(eqx.Module):
     def locate(self, u: Any) -> Any:
         """Span with breaks[i] <= u < breaks[i+1]; the last non-empty one at the right end."""
         if is_concrete(self, u):
-            inner = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
-            return np.clip(inner, *np.asarray(self.ends)).astype(np.int32)
+            number = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
+            return np.clip(number, *np.asarray(self.ends)).astype(np.int32)
         inner = _last_not_above(jnp.asarray(self.breaks), jnp.asarray(u))
         return jnp.clip(inner, self.ends[0], self.ends[1]).astype(jnp.int32)
 
@@ -139,10 +139,17 @@ def make_axis(knots: Float[Numbers, " knots"], order: int) -> Axis:
     after = xp.where(last < ends[1], right, number)
     centre, half = _middles(breaks)
     bounds = xp.stack([breaks[first], breaks[last + 1], centre, half])
-    whole = [x.astype(np.int32) for x in (first, last, ends, before, after)]
-    real = [x.astype(dtype) for x in (breaks, bounds, span_polynomials(knots, order))]
-    creased = bool(np.any(crease & ~at_end)) if concrete else True
-    return Axis(real[0], real[1], *whole, real[2], creased)
+    return Axis(
+        breaks=breaks.astype(dtype),
+        bounds=bounds.astype(dtype),
+        first=first.astype(np.int32),
+        last=last.astype(np.int32),
+        ends=ends.astype(np.int32),
+        before=before.astype(np.int32),
+        after=after.astype(np.int32),
+        polynomials=span_polynomials(knots, order).astype(dtype),
+        creased=bool(np.any(crease & ~at_end)) if concrete else True,
+    )
 
 
 def _middles(breaks: Any) -> tuple[Any, Any]:

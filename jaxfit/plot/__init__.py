@@ -1,5 +1,6 @@
 """Pictures of fits; needs Matplotlib (``pip install 'jaxfit-surfaces[plot]'``)."""
 
 from jaxfit.plot._picture import surface_and_errors
+from jaxfit.plot._zebra import zebra_stripes
 
-__all__ = ["surface_and_errors"]
+__all__ = ["surface_and_errors", "zebra_stripes"]

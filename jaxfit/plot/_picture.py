@@ -77,7 +77,7 @@ def surface_and_errors(
     if title:
         figure.suptitle(title, fontsize=14, fontweight="bold")
     if path is not None:
-        _save(figure, Path(path), dpi)
+        save(figure, Path(path), dpi)
     return figure
 
 
@@ -167,7 +167,7 @@ def _turn_like_the_surface(axes: "Axes", surface: Any, view: View) -> None:
         axes.invert_yaxis()
 
 
-def _save(figure: "Figure", path: Path, dpi: int) -> None:
+def save(figure: "Figure", path: Path, dpi: int) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=path.suffix.lstrip(".").lower() or "png", dpi=dpi)
     write_atomically(path, buffer.getvalue())

@@ -1,5 +1,7 @@
 """A shaded picture of a surface without a mesh: many points, the nearest one wins each pixel."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -18,28 +20,46 @@ _LINE = np.array([0.13, 0.25, 0.40])
 _LIGHT = np.array([-0.68, 0.42, 0.60])  # from the upper left, in front of the picture
 
 
-def render(surface: BSplineSurface, aspect: float = 1.1) -> tuple[Float[np.ndarray, "height width 4"], View]:
+def render(
+    surface: BSplineSurface,
+    aspect: float = 1.1,
+    view: View | None = None,
+    paint: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+) -> tuple[Float[np.ndarray, "height width 4"], View]:
     """The surface in RGBA with shading and some of its knot lines, and the view it is seen in.
 
-    The picture is transparent round the surface, and `aspect` times as wide as high.
+    The picture is transparent round the surface, and `aspect` times as wide as high. A `paint`
+    gives the colours (a, b, 3) at parameters (a,) and (b,); nothing is shaded or drawn on them.
     """
-    (u0, u1), (v0, v1) = surface.domain
-    us, vs = np.linspace(u0, u1, _COARSE), np.linspace(v0, v1, _COARSE)
-    coarse = _points(surface, us, vs)
-    view = choose_view(coarse)
+    us, vs, coarse = coarse_points(surface)
+    view = choose_view(coarse) if view is None else view
     seen = view(coarse)
     size = np.ptp(seen[..., :2].reshape(-1, 2), axis=0).max()
     pixel = max(size, np.finfo(float).tiny) / (_PIXELS - 1)
     us, vs = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
     xyz = _points(surface, us, vs)
     seen = view(xyz)
-    colour = _ground(xyz, view) * _shade(seen)[..., None]
+    if paint is not None:
+        colour = paint(us, vs)
+    else:
+        colour = _ground(xyz, view) * _shade(seen)[..., None]
+        _draw_knot_lines(colour, surface, us, vs)
+    image = _halve(_splat(seen.reshape(-1, 3), np.clip(colour, 0, 1).reshape(-1, 3), pixel))
+    return _pad(image, aspect), view
+
+
+def coarse_points(surface: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Evenly spaced parameters along u and along v, and the points there: enough to choose a view."""
+    (u0, u1), (v0, v1) = surface.domain
+    us, vs = np.linspace(u0, u1, _COARSE), np.linspace(v0, v1, _COARSE)
+    return us, vs, _points(surface, us, vs)
+
+
+def _draw_knot_lines(colour: np.ndarray, surface: BSplineSurface, us: np.ndarray, vs: np.ndarray) -> None:
     for axis, (knots, at) in enumerate(((surface.knots_u, us), (surface.knots_v, vs))):
         line = np.moveaxis(colour, axis, 0)  # a view: drawing on it draws on `colour`
         near = _near_a_knot(np.asarray(knots, dtype=float), at)
         line[near] = 0.5 * line[near] + 0.5 * _LINE
-    image = _halve(_splat(seen.reshape(-1, 3), np.clip(colour, 0, 1).reshape(-1, 3), pixel))
-    return _pad(image, aspect), view
 
 
 def _points(surface: BSplineSurface, us: np.ndarray, vs: np.ndarray) -> np.ndarray:

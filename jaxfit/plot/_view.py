@@ -53,6 +53,14 @@ def choose_view(net: Float[np.ndarray, "a b 3"]) -> View:
     return View(*_frame(normal, _TILT if relief else _TILT_ROUND), stretch, relief, factor)
 
 
+def view_from(toward: Float[np.ndarray, "3"]) -> View:
+    """The view from a far eye in the direction `toward`, unstretched; z points up, or y as on a map."""
+    toward = _unit(toward)
+    up = np.eye(3)[1 if abs(toward[2]) > 0.9 else 2]
+    right = _unit(np.cross(up, toward))
+    return View(right, np.cross(toward, right), toward, np.ones(3), "", 1)
+
+
 def _mean_normal(net: np.ndarray) -> np.ndarray:
     """Unit vector of the surface's oriented area."""
     areas = np.cross(net[1:, 1:] - net[:-1, :-1], net[:-1, 1:] - net[1:, :-1])

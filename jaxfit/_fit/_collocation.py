@@ -1,0 +1,132 @@
+"""The collocation system of a grid at given parameters: every point's own few basis functions.
+
+For a net with one control point for each data point, (N P)_ij = R(u_ij, v_ij). As long as every foot stays in
+the support of the basis functions of its own control point, N reaches no farther than K - 1 rows and L - 1
+columns from it, and N P is a fixed stencil: a sum of shifted copies of the net, each times an array of
+coefficients, with no gather.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._cells import horner
+from jaxfit._splines._pieces import Axis, Pieces
+
+
+class Windows(eqx.Module):
+    """Non-zero basis functions of every grid point: the first one's number, and the values of all."""
+
+    first_u: Int[Array, "nu nv"]
+    first_v: Int[Array, "nu nv"]
+    basis_u: Float[Array, "K nu nv"]
+    basis_v: Float[Array, "L nu nv"]
+
+    @property
+    def offset_u(self) -> Int[Array, "nu nv"]:
+        """Which of its K functions is the control point's own, counted from the last; 0 to K - 1 if any."""
+        number = jnp.arange(self.first_u.shape[0], dtype=jnp.int32)[:, None]
+        return self.first_u - number + self.basis_u.shape[0] - 1
+
+    @property
+    def offset_v(self) -> Int[Array, "nu nv"]:
+        """As `offset_u`."""
+        number = jnp.arange(self.first_v.shape[1], dtype=jnp.int32)[None, :]
+        return self.first_v - number + self.basis_v.shape[0] - 1
+
+    def is_local(self) -> Bool[Array, ""]:
+        """Whether every foot lies in the support of its own control point's basis functions."""
+        parts = ((self.offset_u, self.basis_u), (self.offset_v, self.basis_v))
+        inside = [jnp.all((offset >= 0) & (offset < basis.shape[0])) for offset, basis in parts]
+        return inside[0] & inside[1]
+
+    def own(self) -> tuple[Float[Array, "nu nv"], Float[Array, "nu nv"]]:
+        """N_i(u_ij) and N_j(v_ij), zero outside their support."""
+        return _own(self.offset_u, self.basis_u), _own(self.offset_v, self.basis_v)
+
+
+def _own(offset: Array, basis: Array) -> Array:
+    last = basis.shape[0] - 1
+    # A foot whose window begins at its own control point has it first, one that ends there last.
+    return sum(
+        (jnp.where(offset == last - r, basis[r], 0.0) for r in range(1, last + 1)), _first(offset, basis)
+    )
+
+
+def _first(offset: Array, basis: Array) -> Array:
+    return jnp.where(offset == basis.shape[0] - 1, basis[0], 0.0)
+
+
+def windows_at(pieces: Pieces, u: Float[Array, "nu nv"], v: Float[Array, "nu nv"]) -> Windows:
+    """The basis functions at the parameters of every grid point."""
+    first_u, basis_u = basis_at(pieces.axis_u, u)
+    first_v, basis_v = basis_at(pieces.axis_v, v)
+    return Windows(first_u, first_v, basis_u, basis_v)
+
+
+def basis_at(axis: Axis, u: Float[Array, "..."]) -> tuple[Int[Array, "..."], Float[Array, "K ..."]]:
+    """Number of the first non-zero function (that of the cell) and the values of all K."""
+    cell = axis.locate(u)
+    order = axis.polynomials.shape[1]
+    s = (u - axis.centre[cell]) / axis.half[cell]
+    flat, first = jnp.asarray(axis.polynomials).reshape(-1), cell * order**2
+    number = np.arange(order**2).reshape(order, order)
+    values = [horner([flat[first + int(i)] for i in row], s, 0) for row in number]
+    return cell, jnp.stack(values)
+
+
+class Stencil(eqx.Module):
+    """N as shifts of the net: coefficients for the shifts -(K - 1) ... K - 1 and -(L - 1) ... L - 1."""
+
+    along_u: Float[Array, "shifts_u nu nv"]
+    along_v: Float[Array, "shifts_v nu nv"]
+
+    def __call__(self, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+        """R at every foot."""
+        (shifts_u, nu, nv), shifts_v = self.along_u.shape, self.along_v.shape[0]
+        half_u, half_v = shifts_u // 2, shifts_v // 2
+        wide = jnp.pad(net, ((0, 0), (half_u, half_u), (half_v, half_v)))
+        total: Any = 0.0
+        for a in range(shifts_u):
+            rows = wide[:, a : a + nu]
+            row: Any = sum(self.along_v[b][None] * rows[:, :, b : b + nv] for b in range(shifts_v))
+            total = total + self.along_u[a][None] * row
+        return total
+
+
+def stencil_of(windows: Windows) -> Stencil:
+    """The stencil; right only where `windows.is_local()`."""
+    return Stencil(_shifted(windows.offset_u, windows.basis_u), _shifted(windows.offset_v, windows.basis_v))
+
+
+def _shifted(offset: Array, basis: Array) -> Array:
+    order = basis.shape[0]
+    coefficients = []
+    for shift in range(2 * order - 1):
+        terms = [jnp.where(offset + r == shift, basis[r], 0.0) for r in range(order)]
+        coefficients.append(sum(terms[1:], terms[0]))
+    return jnp.stack(coefficients)
+
+
+def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+    """R at every foot, wherever it is: each fetches its own control points."""
+    d, _, nv = net.shape
+    first = windows.first_u * nv + windows.first_v
+    values = []
+    for k in range(d):
+        flat = net[k].reshape(-1)
+        rows: list[Any] = [
+            sum(basis * flat[first + (r * nv + q)] for q, basis in enumerate(windows.basis_v))
+            for r in range(windows.basis_u.shape[0])
+        ]
+        values.append(
+            sum(
+                (basis * row for basis, row in zip(windows.basis_u[1:], rows[1:], strict=True)),
+                windows.basis_u[0] * rows[0],
+            )
+        )
+    return jnp.stack(values)

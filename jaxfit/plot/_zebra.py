@@ -1,0 +1,132 @@
+"""`zebra_stripes`: surfaces side by side, as a striped room is reflected in them."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxfit._checks import as_direction, check_kind
+from jaxfit._quality import Vector, zebra_grid
+from jaxfit._splines import BSplineSurface
+from jaxfit.plot._picture import save
+from jaxfit.plot._render import coarse_points, render
+from jaxfit.plot._view import View, choose_view, view_from
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DARK = np.array([0.07, 0.09, 0.13])
+_BRIGHT = np.array([0.97, 0.96, 0.93])
+_NO_NORMAL = np.array([0.85, 0.20, 0.20])
+_SHARPNESS = 4.0  # a wave of this height, cut at 0 and 1, is nearly a step
+
+
+def zebra_stripes(
+    surfaces: BSplineSurface | Sequence[BSplineSurface],
+    path: str | os.PathLike | None = None,
+    captions: Sequence[str] = (),
+    stripes: int = 16,
+    direction: Vector | None = None,
+    view: Vector | None = None,
+    title: str = "",
+    dpi: int = 150,
+) -> "Figure":
+    """One picture of the zebra stripes of one or several surfaces, side by side in one view.
+
+    Stripes show what shading hides: where they wiggle, kink or break, so do curvatures and normals.
+    The stripes are those of `jaxfit.zebra`, cut nearly sharp; places without a normal are
+    red. Neither pyplot nor a backend is touched.
+
+    Parameters
+    ----------
+    surfaces
+        What to draw, in three dimensions, best in the same place and unit.
+    path
+        Where to save the picture (.png, .pdf, .svg, ...), whole or not at all; None saves nothing.
+    captions
+        One for each surface, or none.
+    stripes
+        Bright stripes in half a turn of the reflected ray (default 16).
+    direction
+        Axis of the lights (3,), across which stripes run. Default: upward in the picture.
+    view
+        Direction from the surfaces to the eye (3,). Default: the outer side of the first surface. To
+        judge a symmetry, look along its plane.
+    title
+        Heading, for instance the name of the data.
+    dpi
+        Pixels per inch; each surface takes 6 x 5.2 inches.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ImportError
+        If Matplotlib is not installed.
+    ValueError
+        If there is no surface, one is not in three dimensions, or there are more or fewer captions.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(
+            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+        ) from error
+    drawn = _checked(surfaces, captions)
+    camera = _camera(drawn[0], view)
+    axis = camera.up if direction is None else direction
+    figure = Figure(figsize=(6 * len(drawn), 5.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, len(drawn), squeeze=False)[0]
+    for i, (surface, place) in enumerate(zip(drawn, axes, strict=True)):
+        place.imshow(_striped(surface, camera, axis, stripes))
+        place.set_axis_off()
+        if captions:
+            place.set_title(captions[i], fontsize=11)
+    if title:
+        figure.suptitle(title, fontsize=14, fontweight="bold")
+    if path is not None:
+        save(figure, Path(path), dpi)
+    return figure
+
+
+def _striped(surface: BSplineSurface, camera: View, axis: Vector, stripes: int) -> np.ndarray:
+    def paint(us: np.ndarray, vs: np.ndarray) -> np.ndarray:
+        values = np.asarray(zebra_grid(surface, us, vs, axis, stripes, camera.toward), dtype=float)
+        bright = np.clip(0.5 + _SHARPNESS * (values - 0.5), 0, 1)[..., None]
+        return np.where(np.isnan(bright), _NO_NORMAL, _DARK + bright * (_BRIGHT - _DARK))
+
+    return render(surface, view=camera, paint=paint)[0]
+
+
+def _camera(surface: BSplineSurface, view: Vector | None) -> View:
+    if view is None:
+        # The eye of the chosen view, but no stretch: stripes are those of the true shape.
+        return view_from(choose_view(coarse_points(surface)[2]).toward)
+    return view_from(np.asarray(as_direction("view", view, 3), dtype=float))
+
+
+def _checked(
+    surfaces: BSplineSurface | Sequence[BSplineSurface], captions: Sequence[str]
+) -> list[BSplineSurface]:
+    drawn = [surfaces] if isinstance(surfaces, BSplineSurface) else list(surfaces)
+    if not drawn:
+        raise ValueError("surfaces must hold at least one surface, but is empty; give one.")
+    for surface in drawn:
+        check_kind("surfaces", surface, BSplineSurface, "a BSplineSurface or a list of them")
+        if surface.dimension != 3:
+            raise ValueError(
+                f"surfaces must be in three dimensions, but one has {surface.dimension}; use affine() "
+                "to take it there."
+            )
+    if captions and len(captions) != len(drawn):
+        raise ValueError(
+            f"captions must be one for each of the {len(drawn)} surfaces, but there are {len(captions)}; "
+            "give as many, or none."
+        )
+    return drawn
