@@ -100,10 +100,16 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any]
 
 
 def _history(account: Account) -> History:
-    if not is_concrete(account) or account.average.shape == (1,):
-        return History(account.average, account.maximum)
+    """The errors; solves evaluate nothing for a foot and move none, and corrections report in `stats`."""
+    average, maximum = account.average, account.maximum
+    if not is_concrete(account):
+        none = 0.0 * average
+        return History(average, maximum, none, none)
     end = int(account.step) + 1
-    return History(*(jnp.asarray(np.asarray(x)[:end]) for x in (account.average, account.maximum)))
+    if average.shape != (end,):
+        average, maximum = (jnp.asarray(np.asarray(x)[:end]) for x in (average, maximum))
+    none = jnp.asarray(np.zeros(end, average.dtype))
+    return History(average, maximum, none, none)
 
 
 def _ending(maximum: Any, step: Any, limits: tuple[Any, Any, Any], net: Any, throw: bool) -> Any:
