@@ -13,3 +13,4 @@ from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight
 from jaxfit._fit._repositioning import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit._repositioning import UnitWeights as UnitWeights
 from jaxfit._fit._results import RESULTS as RESULTS
+from jaxfit._fit._standard_interpolation import StandardInterpolation as StandardInterpolation

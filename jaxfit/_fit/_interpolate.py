@@ -16,6 +16,8 @@ from jaxfit._fit._loop import Limits, begin, run
 from jaxfit._fit._measure import border
 from jaxfit._fit._problem import make_problem, unit_of
 from jaxfit._fit._repositioning import lowest_eigenvalue
+from jaxfit._fit._standard_fit import standard_fit
+from jaxfit._fit._standard_interpolation import StandardInterpolation
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import advise_x64
 from jaxfit._splines import BSplineSurface, averaging_knots
@@ -25,7 +27,7 @@ DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 
 def interpolate(
     grid: ArrayLike,
-    method: GeometricInterpolation | None = None,
+    method: GeometricInterpolation | StandardInterpolation | None = None,
     order: tuple[int, int] = (4, 4),
     tolerance: float | None = None,
     max_steps: int = 1000,
@@ -38,16 +40,17 @@ def interpolate(
     ----------
     grid : array (n, m, d)
         Any unit; at least `order` points in each direction.
-    method : GeometricInterpolation, optional
+    method : GeometricInterpolation or StandardInterpolation, optional
     order : (K, L)
         Degree + 1 along the first and the second index, each 2 to 8.
     tolerance : float, optional
         The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
         1e-12 in float64, 2e-6 in float32.
     max_steps : int
-        Most iterations.
+        Most iterations (of `StandardInterpolation`, cycles of GMRES).
     progress : callable, optional
-        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
+        not by `StandardInterpolation`, which is done in one go.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
 
@@ -63,9 +66,9 @@ def interpolate(
 
     Notes
     -----
-    Section 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
-    differentiate through a fit raises a TypeError. On a closed grid (first row equal to the last) the feet
-    stay on their side of the seam.
+    Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; standard fits
+    are differentiable too, while to differentiate through a geometric one raises a TypeError. On a closed
+    grid (first row equal to the last) the feet stay on their side of the seam.
     """
     check_order(order)
     check_number("max_steps", max_steps, 0, whole=True)
@@ -73,6 +76,8 @@ def interpolate(
         check_number("tolerance", tolerance, 0.0)
     data = _checked_grid(grid, order)
     method = GeometricInterpolation() if method is None else method
+    if isinstance(method, StandardInterpolation):
+        return standard_fit(method, data, order, tolerance, max_steps, throw)
     check_kind("method", method, GeometricInterpolation, "GeometricInterpolation()")
     n, m, d = data.shape
     unit = unit_of(data.reshape(-1, d))

@@ -1,0 +1,133 @@
+"""From a grid to a Fit by standard interpolation: units, checks, and one dispatch."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfit._checks import is_concrete
+from jaxfit._fit._fit_result import Fit, History, sentence_of
+from jaxfit._fit._grid_systems import Account
+from jaxfit._fit._loop import code_of, result_of
+from jaxfit._fit._problem import Unit, unit_of
+from jaxfit._fit._results import RESULTS
+from jaxfit._fit._standard_interpolation import Solution, StandardInterpolation, solved
+from jaxfit._parameters import grid_parameters
+from jaxfit._precision import advise_x64, bucket, working_dtype
+from jaxfit._splines import BSplineSurface
+
+DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
+
+
+def standard_fit(
+    method: StandardInterpolation,
+    grid: Any,
+    order: tuple[int, int],
+    tolerance: Any,
+    max_steps: int,
+    throw: bool,
+) -> Fit:
+    """The whole fit of a checked grid.
+
+    Raises ValueError where concrete data has no extent along one index, or is too uneven for the order.
+    """
+    unit = unit_of(grid.reshape(-1, grid.shape[2]))
+    concrete = is_concrete(grid)
+    dtype = working_dtype() if concrete else jnp.result_type(grid, float)
+    inner = unit.inward(grid).astype(dtype)
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
+    elif is_concrete(tolerance):
+        advise_x64(float(tolerance), np.dtype(dtype))
+    xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
+    limits = (
+        xp.asarray(unit.diagonal / unit.scale, dtype),
+        xp.asarray(tolerance, dtype),
+        xp.asarray(max_steps, np.int32),
+    )
+    room = bucket(int(max_steps) + 1) if method.iterative else 1
+    solution = solved(method, (int(order[0]), int(order[1])), room, inner, limits)
+    if is_concrete(solution):
+        _check(method, order, inner, solution)
+    return _fit(solution, unit, grid, limits, throw)
+
+
+def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, solution: Solution) -> None:
+    """Raise where a grid has no parameters, so that the traced part made some up, or no solution."""
+    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
+    if (np.asarray(solution.extent) <= noise).any():
+        # The exact test is the parametrisation's own; no row is shorter than its longest step.
+        grid_parameters(inner, method.parametrisation)
+    if not np.isfinite(solution.maximum):
+        raise ValueError(
+            f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
+            "matrix is singular to rounding; lower the order, or remove points that repeat."
+        )
+
+
+def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any], throw: bool) -> Fit:
+    concrete = is_concrete(solution)
+    account = solution.account
+    net = unit.outward(np.asarray(solution.net) if concrete else solution.net)
+    ends = np.asarray([0, -1])
+    corner = ends[:, None], ends[None, :]
+    # Corners are the data, to the last bit.
+    if concrete:
+        net[corner] = np.asarray(grid)[corner]
+        net = jnp.asarray(net, solution.net.dtype)
+    else:
+        net = net.at[corner].set(grid[corner].astype(net.dtype))
+    stats = {
+        "num_steps": account.step,
+        "diagonal": unit.diagonal,
+        "unconverged_feet": solution.lost,
+        "corrections": solution.corrections,
+        "parameter_change": solution.parameter_change,
+    }
+    surface = BSplineSurface(net, *solution.knots)
+    return Fit(
+        surface=surface,
+        u=solution.u,
+        v=solution.v,
+        errors=solution.errors,
+        average_error=solution.average,
+        maximum_error=solution.maximum,
+        history=_history(account),
+        result=_ending(solution.maximum, account.step, limits, net, throw),
+        stats=stats,
+    )
+
+
+def _history(account: Account) -> History:
+    """The errors; solves evaluate nothing for a foot and move none, and corrections report in `stats`."""
+    average, maximum = account.average, account.maximum
+    if not is_concrete(account):
+        none = 0.0 * average
+        return History(average, maximum, none, none)
+    end = int(account.step) + 1
+    if average.shape != (end,):
+        average, maximum = (jnp.asarray(np.asarray(x)[:end]) for x in (average, maximum))
+    none = jnp.asarray(np.zeros(end, average.dtype))
+    return History(average, maximum, none, none)
+
+
+def _ending(maximum: Any, step: Any, limits: tuple[Any, Any, Any], net: Any, throw: bool) -> Any:
+    """Why the fit stopped; raises the sentence if `throw` and it has not converged."""
+    _, tolerance, most = limits
+    if is_concrete(maximum, step, tolerance, most):
+        if float(maximum) <= float(tolerance):
+            return RESULTS.converged
+        result = RESULTS.max_steps_reached if 0 < int(most) <= int(step) else RESULTS.stalled
+        if throw:
+            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
+        return result
+    finite = jnp.isfinite(maximum)
+    code = jnp.where(
+        (step >= most) & (step > 0), code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled)
+    )
+    code = jnp.where(finite, code, code_of(RESULTS.diverged))
+    result = result_of(jnp.where(maximum <= tolerance, code_of(RESULTS.converged), code))
+    if throw:
+        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
+    return result
