@@ -4,8 +4,8 @@
 
 One row for each grid and method: iterations, maximum and average error in per cent of the diagonal,
 evaluations of the surface per point, the median time of a fit with the spread (lowest to highest), and the
-first call, which compiles. With the program of an independent implementation and its work folder, the same runs
-there follow.
+first call, which compiles. With the program of an independent implementation and its work folder, the same
+runs there follow.
 """
 
 import argparse
