@@ -7,6 +7,8 @@ exceeds the rival's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv
 only. Every sample this close that is not beside a foot already found is a start.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ WIDER = 1.5  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
 NEIGHBOURS = (8, 24, 80, 200)  # as many as it takes
 LEAST_STARTS = 4  # tried although a sample beside them is nearer
+BLOCK = 8192  # points
 LEAF = 32  # samples; the tree's own default is slower here
 
 
@@ -36,9 +39,9 @@ class Search:
         self.points = points
         self.distance, self.index = self._query(slice(None), NEIGHBOURS[0])
 
-    def _query(self, which: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def _query(self, which: Any, count: int, workers: int = -1) -> tuple[np.ndarray, np.ndarray]:
         count = min(count, self.tree.n)
-        distance, index = self.tree.query(self.points[which], k=count, workers=-1)
+        distance, index = self.tree.query(self.points[which], k=count, workers=workers)
         return distance.reshape(-1, count), index.reshape(-1, count)
 
     def nearest(self) -> tuple[np.ndarray, np.ndarray]:
@@ -57,8 +60,18 @@ class Search:
 
     def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
         """The samples that may lead to a foot nearer than those at (u, v)."""
-        which = np.arange(len(distance))
-        near, index = self.distance, self.index
+        parts = [slice(begin, begin + BLOCK) for begin in range(0, len(distance), BLOCK)]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = list(pool.map(lambda part: self._rivals_of(part, u, v, distance), parts))
+        who, sample = (np.concatenate(x) for x in zip(*found, strict=True))
+        return Rivals(self, who, sample)
+
+    def _rivals_of(
+        self, part: slice, u: np.ndarray, v: np.ndarray, distance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of some points: so few that everything stays in the caches."""
+        which = np.arange(len(distance))[part]
+        near, index = self.distance[part], self.index[part]
         who, sample = [], []
         steps: tuple[Any, ...] = (*NEIGHBOURS[1:], None)
         for more in steps:
@@ -73,16 +86,13 @@ class Search:
             which = which[crowded]
             if not which.size:
                 break
-            near, index = self._query(which, more)
-        return Rivals(self, np.concatenate(who), np.concatenate(sample))
+            near, index = self._query(which, more, workers=1)
+        return np.concatenate(who), np.concatenate(sample)
 
     def _is_crowded(self, last: np.ndarray, index: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Where samples farther than the last may matter, having at most WIDER times the slack of these."""
-        crowded = last**2 <= reach**2 + self.slack.max() + reach * self.sag.max()
-        few = np.flatnonzero(crowded)
-        wide, sag = (WIDER * x[index[few].T].max(axis=0) for x in (self.slack, self.sag))
-        crowded[few] = last[few] ** 2 <= reach[few] ** 2 + wide + reach[few] * sag
-        return crowded
+        wide, sag = (np.minimum(x.max(), WIDER * x[index.T].max(axis=0)) for x in (self.slack, self.sag))
+        return last**2 <= reach**2 + wide + reach * sag
 
     def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
         """Whether none of the eight samples around `sample` is nearer to the point `who`.
