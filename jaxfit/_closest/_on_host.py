@@ -19,7 +19,7 @@ from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-CHUNK = 1 << 18
+CHUNK = 1 << 16
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
 
 

@@ -5,6 +5,7 @@ it is in. Feet change cells, so the next pass lays them out anew; the first hold
 last ones a few stragglers.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
@@ -16,8 +17,9 @@ from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
 STEPS_PER_PASS = 4
-SLOTS_PER_BLOCK = 32768  # what a block computes stays in the caches
-SINGLES_PER_BLOCK = 4096  # the same for rows of one point, each with a polynomial of its own
+# On a CPU, what a block computes stays in the caches, and is too little to be worth sharing among cores, which
+# costs more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
+SLOTS_PER_BLOCK = 4096
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096
 SHARED_FROM_FILL = 2
@@ -70,7 +72,7 @@ def _pass(
 ) -> Feet:
     """A few steps for every foot in a row."""
     count, width = rows.point.shape
-    size = min(count, SLOTS_PER_BLOCK // width if width > 1 else SINGLES_PER_BLOCK)
+    size = min(count, SLOTS_PER_BLOCK // width) if jax.default_backend() == "cpu" else count
 
     def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         start, feet = carry
