@@ -17,8 +17,8 @@ from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
 STEPS_PER_PASS = 4
-# On a CPU, what a block computes stays in the caches, and is too little to be worth sharing among cores, which
-# costs more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
+# On a CPU, what a block computes stays in the caches, and is too little to be shared among cores, which costs
+# more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
 SLOTS_PER_BLOCK = 4096
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096
