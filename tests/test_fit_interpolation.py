@@ -185,14 +185,12 @@ def test_hostile_grids_end_with_finite_numbers_and_a_reason(case):
     assert bool(fit.converged) == (float(fit.maximum_error) <= 1e-12)
 
 
-def test_jit_and_vmap_give_the_same_as_a_plain_call():
+def test_vmap_inside_jit_gives_the_same_as_plain_calls():
     def net(grid):
         return jf.interpolate(grid, tolerance=1e-9).surface.control_points
 
-    plain = np.asarray(net(GRID))
-    assert np.abs(np.asarray(jax.jit(net)(jnp.asarray(GRID))) - plain).max() < 1e-12
-    both = jax.vmap(net)(jnp.stack([jnp.asarray(GRID), jnp.asarray(2 * GRID[::-1])]))
-    assert np.abs(np.asarray(both[0]) - plain).max() < 1e-12
+    both = jax.jit(jax.vmap(net))(jnp.stack([jnp.asarray(GRID), jnp.asarray(2 * GRID[::-1])]))
+    assert np.abs(np.asarray(both[0]) - np.asarray(net(GRID))).max() < 1e-12
     assert np.abs(np.asarray(both[1]) - np.asarray(net(2 * GRID[::-1]))).max() < 1e-12
 
 

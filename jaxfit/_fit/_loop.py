@@ -23,6 +23,7 @@ from jaxfit._splines._pieces import Pieces, pieces_on
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
+LEAST_HISTORY = 1024  # entries, so that other limits on the iterations compile nothing
 GROWTH = 1e3  # errors beyond this many times the first ones count as divergence
 
 
@@ -101,7 +102,7 @@ def begin(net: Array, u: Array, v: Array, most: int) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries."""
     none = jnp.zeros(u.shape, jnp.int32)
     measured = Measured(u, v, jnp.zeros_like(u), none, none > 0)
-    empty = jnp.full(bucket(most + 1), jnp.nan, net.dtype)
+    empty = jnp.full(bucket(most + 1, LEAST_HISTORY), jnp.nan, net.dtype)
     running = jnp.asarray(code_of(RESULTS.running), jnp.int32)
     turn = Turn(net, jnp.asarray(0, jnp.int32), Records(empty, empty, empty, empty))
     return Carry(net, jnp.asarray(-1, jnp.int32), turn, measured, running)
@@ -141,7 +142,7 @@ def advance(
         # A step into nonsense is taken back, and leaves no trace.
         back = eqx.tree_at(lambda c: c.code, carry, code)
         bad = (code == code_of(RESULTS.diverged)) & (carry.step >= 0)
-        return jax.tree.map(lambda a, b: jnp.where(bad, a, b), back, good)
+        return lax.cond(bad, lambda: back, lambda: good)
 
     return lax.while_loop(lambda c: (c.code == running) & (c.next.step <= until), body, carry)
 
