@@ -23,11 +23,19 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+# As in the session itself, code that compiles quickly.
+SURROUNDINGS = {
+    "PYTHONPATH": str(CHECKOUT),
+    "JAX_PLATFORMS": "cpu",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+}
+
+
 def command(*argv, **environment):
     """Run `python -m jaxfit`, as a user would, with no test session around it."""
     return subprocess.run(
         [sys.executable, "-m", "jaxfit", *argv],
-        env=os.environ | {"PYTHONPATH": str(CHECKOUT), "JAX_PLATFORMS": "cpu"} | environment,
+        env=os.environ | SURROUNDINGS | environment,
         capture_output=True,
         text=True,
         check=False,

@@ -81,8 +81,10 @@ def test_feet_on_folded_base_surfaces_of_scans_are_nearest(name):
     sides = Boundary(*(data[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
     net = (24, 40) if name == "blade_wrap_3000" else (42, 42)
     base = base_surface(sides, data["points"], net=net)
-    near, _, _ = queries(base, 1500)
-    assert_nearest(base, np.concatenate([data["points"][::4], near])[:2000])
+    near, _, _ = queries(base, COUNT // 2)
+    assert_nearest(
+        base, np.concatenate([data["points"][:: len(data["points"]) // (COUNT // 2)], near])[:COUNT]
+    )
 
 
 def test_creases_do_not_stop_the_search():

@@ -1,7 +1,6 @@
 """Geometric interpolation with the feet held: a linear fixed-point iteration on the net (section 3.3.1)."""
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -94,32 +93,13 @@ def iterate_frozen(method: Any, limits: Limits, system: System, most: Array, tur
     Records the errors at the held feet. Unless `most` ended it, the net it ends with has been recorded.
     """
     stencil, windows = stencil_of(system.windows), system.windows
-
-    def loop(values: Callable[[Array], Array], turn: Turn) -> Turn:
-        return _loop(method, limits, system, most, values, turn)
-
-    return lax.cond(
-        windows.is_local(),
-        lambda turn: loop(stencil, turn),
-        lambda turn: loop(lambda net: gathered(windows, net), turn),
-        turn,
-    )
-
-
-def _loop(
-    method: Any,
-    limits: Limits,
-    system: System,
-    most: Array,
-    values: Callable[[Array], Array],
-    turn: Turn,
-) -> Turn:
+    local = windows.is_local()
     last = turn.step + most
     acceleration: AbstractAcceleration = method.acceleration
 
     def body(x: tuple[Array, Array, Array, Records, Any]) -> tuple[Array, Array, Array, Records, Any]:
         _, net, step, records, state = x
-        e = system.target - values(net)
+        e = system.target - lax.cond(local, lambda x: stencil(x), lambda x: gathered(windows, x), net)
         square: Any = sum(e[1:] ** 2, e[0] ** 2)
         error = jnp.where(system.held, 0.0, jnp.sqrt(square)) / system.diagonal
         average, maximum = jnp.mean(error), jnp.max(error)
