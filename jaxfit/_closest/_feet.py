@@ -14,9 +14,7 @@ from jaxfit._closest._steps import AbstractFootMethod, Forms, Newton, measure
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 2.0  # in local coordinates: a cell
-# In units of a cell's half width: where its polynomial is the surface, and where it still leads on.
-INSIDE, NEAR = 1.0 + 1e-6, 2.0
-LED_ON = 8  # evaluations; a foot that takes longer may be going round in circles across a knot
+INSIDE = 1.0 + 1e-6  # in units of a cell's half width: where its polynomial is the surface
 # The error foreseen after a step may be this share of the tolerance, for the foot to count as found; so small
 # a share because only the order of magnitude is foreseen.
 FORESIGHT = 0.01
@@ -24,7 +22,6 @@ FORESIGHT = 0.01
 PATIENCE = 30
 
 GOING, ARRIVED, GIVEN_UP = 0, 1, 2
-UNJUDGED = -1  # in place of the number of halvings: the trial comes from a continued polynomial
 
 
 class Feet(eqx.Module):
@@ -78,7 +75,7 @@ class Feet(eqx.Module):
 
     @property
     def halvings(self) -> Int[Array, "*shape"]:
-        """How often the present step has been halved, or UNJUDGED."""
+        """How often the present step has been halved."""
         return self.whole[0]
 
     @property
@@ -155,8 +152,7 @@ def advance(
 ) -> Feet:
     """Evaluate every trial, accept or halve it, and propose the next one.
 
-    Distances are judged where the cell's polynomial is the surface. A little outside, where it differs by
-    third order from its neighbour, it still proposes a trial; farther out a foot waits for its own cell.
+    A trial outside the cell whose polynomial is at hand waits until it is laid out with its own.
     """
     always = limits.tolerance < jnp.inf
     u, v, best_u, best_v, best = feet.real
@@ -164,32 +160,27 @@ def advance(
     first = _measure_at(method, always, u, v, target, coefficients, box)
     next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, steps > PATIENCE, box, limits)
     off = jnp.maximum(jnp.abs(u - box.centre_u) * box.rate_u, jnp.abs(v - box.centre_v) * box.rate_v)
-    going = is_going(feet, limits)
-    judged = going & (off <= INSIDE)
-    led_on = going & (off > INSIDE) & (off <= NEAR) & (halvings <= 0) & (steps < LED_ON)
-
+    judged = is_going(feet, limits) & (off <= INSIDE)
     accepted = first.f <= best + limits.slack(first.f)
     still = (next_u == u) & (next_v == v)
-    # What is foreseen rests on the last two steps, so both must have been judged.
+    # What is foreseen rests on the last two steps, so the last one must be whole.
     certain = still | (foreseen & (halvings == 0) & method.quadratic)
     back_u, back_v = 0.5 * (u + best_u), 0.5 * (v + best_v)
     spent = (halvings >= MOST_HALVINGS) | ((back_u == best_u) & (back_v == best_v))
-    moves = led_on | (judged & accepted)
     taken = judged & accepted
     returns = judged & ~accepted
     leaps = taken & certain
     here_u, here_v, here = (jnp.where(leaps, x, y) for x, y in ((next_u, u), (next_v, v), (after, first.f)))
     real = [
-        jnp.where(moves, next_u, jnp.where(returns, back_u, u)),
-        jnp.where(moves, next_v, jnp.where(returns, back_v, v)),
+        jnp.where(taken, next_u, jnp.where(returns, back_u, u)),
+        jnp.where(taken, next_v, jnp.where(returns, back_v, v)),
         jnp.where(taken, here_u, best_u),
         jnp.where(taken, here_v, best_v),
         jnp.where(taken, here, best),
     ]
-    counted = jnp.where(led_on, UNJUDGED, jnp.where(taken, 0, jnp.where(returns, halvings + 1, halvings)))
-    counted = jnp.where(returns & (halvings < 0), 1, counted)
+    counted = jnp.where(taken, 0, jnp.where(returns, halvings + 1, halvings))
     state = jnp.where(leaps, ARRIVED, jnp.where(returns & spent, GIVEN_UP, feet.state))
-    numbers = [counted, steps + (judged | led_on), state]
+    numbers = [counted, steps + judged, state]
     return Feet(jnp.stack(real), jnp.stack([x.astype(jnp.int32) for x in numbers]))
 
 
