@@ -133,3 +133,11 @@ def test_feet_on_curves_differentiate_too():
     second = np.asarray(curve.derivative(at, 2))
     expected = tangent / (np.sum(tangent**2, 1) - np.sum(0.02 * normal * second, 1))[:, None]
     np.testing.assert_allclose(slope[np.arange(COUNT), np.arange(COUNT)], expected, rtol=1e-8)
+
+
+def test_vmap_without_starts_searches_globally():
+    surface = helpers.wavy_surface(6, 6)
+    points = np.random.default_rng(5).uniform(-0.2, 1.2, (4, 3))
+    alone = closest_point(surface, points).distance
+    each = jax.vmap(lambda q: closest_point(surface, q[None]).distance[0])(jnp.asarray(points))
+    np.testing.assert_allclose(each, alone, atol=1e-12)

@@ -56,7 +56,16 @@ class Search:
     def elsewhere(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Which samples, a row of them for each foot (u, v), do not lie beside it."""
         row, column = np.divmod(sample, self.along_v.u.size)
-        return self.along_u.apart(row, u) | self.along_v.apart(column, v)
+        apart = self.along_u.apart(row, u) | self.along_v.apart(column, v)
+        # Round a corner, on the other border, there may be another foot, however close.
+        edge_u, edge_v = self.along_u.is_end(u), self.along_v.is_end(v)
+        for here, there, direction, number in (
+            (edge_u, edge_v, self.along_v, column),
+            (edge_v, edge_u, self.along_u, row),
+        ):
+            border = np.flatnonzero(here & ~there)
+            apart[border] |= direction.is_last(number[border])
+        return apart
 
     def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
         """The samples that may lead to a foot nearer than those at (u, v)."""
@@ -118,6 +127,14 @@ class _Direction:
     def __init__(self, u: Any, stretch: Any):
         self.u, self.stretch = np.asarray(u), np.asarray(stretch)
         self.smooth = bool((self.stretch == self.stretch[0]).all())
+
+    def is_end(self, foot: np.ndarray) -> np.ndarray:
+        """Whether feet lie at either end."""
+        return (foot <= self.u[0]) | (foot >= self.u[-1])
+
+    def is_last(self, number: np.ndarray) -> np.ndarray:
+        """Whether samples lie at either end of a direction that has two."""
+        return ((number == 0) | (number == self.u.size - 1)) & (self.u.size > 1)
 
     def apart(self, number: np.ndarray, foot: np.ndarray) -> np.ndarray:
         """Whether samples are more than BESIDE away from a foot, or in another stretch.

@@ -7,6 +7,7 @@ import math
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -135,6 +136,7 @@ def best_samples(
 
     The path inside `jit`, where no tree can be built: exact search over all samples, two starts.
     """
+    samples = jax.tree.map(jnp.asarray, samples)
     a, b = samples.u.shape[0], samples.v.shape[0]
     cloud = samples.points.reshape(a * b, -1)
     row, column = jnp.arange(a * b) // b, jnp.arange(a * b) % b
