@@ -16,7 +16,7 @@ from jaxfit._closest._feet import ARRIVED, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
-STEPS_PER_PASS = 4
+STEPS_PER_PASS = 3
 # On a CPU, what a block computes stays in the caches, and is too little to be shared among cores, which costs
 # more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
 SLOTS_PER_BLOCK = 4096
