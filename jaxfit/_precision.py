@@ -1,12 +1,17 @@
 """What a tolerance asks of the working precision, said once."""
 
 import warnings
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfit._checks import is_concrete
+
 # Relative to the extent of the data: what feet reach without trouble in each precision.
 DEFAULT_FOOT_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
+# The same, for the errors of an interpolation.
+DEFAULT_INTERPOLATION_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 _said = False
 
 
@@ -20,7 +25,16 @@ def default_foot_tolerance(dtype: np.dtype) -> float:
     return DEFAULT_FOOT_TOLERANCE.get(np.dtype(dtype).name, 1e-5)
 
 
-def advise_x64(tolerance: float, dtype: np.dtype) -> None:
+def interpolation_tolerance(tolerance: Any, dtype: np.dtype) -> Any:
+    """The tolerance asked for, with advice where this precision cannot meet it; or the default."""
+    if tolerance is None:
+        return DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
+    if is_concrete(tolerance):
+        advise_x64(float(tolerance), np.dtype(dtype), stacklevel=4)
+    return tolerance
+
+
+def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 3) -> None:
     """Tell the user, once a session, that a tolerance is out of reach in this precision."""
     global _said
     if _said or np.dtype(dtype).itemsize >= 8 or tolerance >= 1e-6:
@@ -29,7 +43,7 @@ def advise_x64(tolerance: float, dtype: np.dtype) -> None:
     warnings.warn(
         f"the tolerance {tolerance:g} is beyond {np.dtype(dtype).name}; switch on "
         "double precision, the flag jax_enable_x64 of jax.config.",
-        stacklevel=3,
+        stacklevel=stacklevel,
     )
 
 

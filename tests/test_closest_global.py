@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
+from jaxfit._closest import _on_host
 
 COUNT = 512  # one size for nearly all queries: few compilations
 
@@ -71,6 +72,17 @@ def test_points_in_rows_get_the_feet_of_points_in_blocks(wavy):
     for name in ("u", "v", "distance"):
         np.testing.assert_allclose(getattr(rows, name)[:COUNT], getattr(blocks, name), atol=1e-9)
     assert np.max(np.asarray(rows.distance[:COUNT] - blocks.distance)) <= 1e-12
+
+
+def test_a_cloud_in_chunks_has_the_feet_of_the_whole(wavy, monkeypatch):
+    points, u, v = queries(wavy)
+    start = (np.clip(u + 0.01, 0, 1), np.clip(v - 0.01, 0, 1))
+    whole, warm = closest_point(wavy, points), closest_point(wavy, points, start)
+    monkeypatch.setattr(_on_host, "CHUNK", COUNT // 2 - 50)  # three parts, the last one shorter
+    for feet, expected in ((closest_point(wavy, points), whole), (closest_point(wavy, points, start), warm)):
+        assert feet.converged.all()
+        np.testing.assert_allclose(feet.distance, expected.distance, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(feet.point, expected.point, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["blade_wrap_3000", "mannequin_head"])

@@ -62,8 +62,7 @@ def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
     # Sorted position p of cell c sits in slot (first row of c) * width + (p - first position of c).
     slot = jnp.arange(points, dtype=jnp.int32) + (first_row * width - start)[ordered]
     slot = jnp.where(ordered < cells, slot, jnp.iinfo(jnp.int32).max)
-    # Rows enough for any distribution of the points.
-    count = points // width + min(cells, points) if width > 1 else points
+    count = row_count(points, cells, width)
     owner = jnp.zeros(count, jnp.int32).at[slot // width].set(ordered, mode="drop")
     table = jnp.full(count * width, points, jnp.int32).at[slot].set(order, mode="drop")
     return Rows(owner, table.reshape(count, width), until[1, cells - 1], points)

@@ -46,19 +46,15 @@ class Windows(eqx.Module):
 
     def own(self) -> tuple[Float[Array, "nu nv"], Float[Array, "nu nv"]]:
         """N_i(u_ij) and N_j(v_ij), zero outside their support."""
-        return _own(self.offset_u, self.basis_u), _own(self.offset_v, self.basis_v)
+        parts = ((self.offset_u, self.basis_u), (self.offset_v, self.basis_v))
+        own_u, own_v = (_coefficient(offset, basis, basis.shape[0] - 1) for offset, basis in parts)
+        return own_u, own_v
 
 
-def _own(offset: Array, basis: Array) -> Array:
-    last = basis.shape[0] - 1
-    # A foot whose window begins at its own control point has it first, one that ends there last.
-    return sum(
-        (jnp.where(offset == last - r, basis[r], 0.0) for r in range(1, last + 1)), _first(offset, basis)
-    )
-
-
-def _first(offset: Array, basis: Array) -> Array:
-    return jnp.where(offset == basis.shape[0] - 1, basis[0], 0.0)
+def _coefficient(offset: Array, basis: Array, shift: int) -> Array:
+    """Of the control point `shift` - (K - 1) places on; zero where it is not in the window."""
+    terms = [jnp.where(offset + r == shift, x, 0.0) for r, x in enumerate(basis)]
+    return sum(terms[1:], terms[0])
 
 
 def windows_at(pieces: Pieces, u: Float[Array, "nu nv"], v: Float[Array, "nu nv"]) -> Windows:
@@ -104,12 +100,7 @@ def stencil_of(windows: Windows) -> Stencil:
 
 
 def _shifted(offset: Array, basis: Array) -> Array:
-    order = basis.shape[0]
-    coefficients = []
-    for shift in range(2 * order - 1):
-        terms = [jnp.where(offset + r == shift, basis[r], 0.0) for r in range(order)]
-        coefficients.append(sum(terms[1:], terms[0]))
-    return jnp.stack(coefficients)
+    return jnp.stack([_coefficient(offset, basis, shift) for shift in range(2 * basis.shape[0] - 1)])
 
 
 def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
@@ -123,10 +114,5 @@ def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d 
             sum(basis * flat[first + (r * nv + q)] for q, basis in enumerate(windows.basis_v))
             for r in range(windows.basis_u.shape[0])
         ]
-        values.append(
-            sum(
-                (basis * row for basis, row in zip(windows.basis_u[1:], rows[1:], strict=True)),
-                windows.basis_u[0] * rows[0],
-            )
-        )
+        values.append(sum(basis * row for basis, row in zip(windows.basis_u, rows, strict=True)))
     return jnp.stack(values)

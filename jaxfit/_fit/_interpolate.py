@@ -19,10 +19,8 @@ from jaxfit._fit._repositioning import lowest_eigenvalue
 from jaxfit._fit._standard_fit import standard_fit
 from jaxfit._fit._standard_interpolation import StandardInterpolation
 from jaxfit._parameters import grid_parameters
-from jaxfit._precision import advise_x64
+from jaxfit._precision import interpolation_tolerance
 from jaxfit._splines import BSplineSurface, averaging_knots
-
-DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 
 
 def interpolate(
@@ -95,10 +93,7 @@ def interpolate(
         knots[symmetry.axis] = symmetry.symmetrise_knots(knots[symmetry.axis])
     net = jnp.asarray(inner)
     surface = BSplineSurface(net, *knots)
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE[np.dtype(surface.control_points.dtype).name]
-    elif is_concrete(tolerance):
-        advise_x64(float(tolerance), np.dtype(surface.control_points.dtype))
+    tolerance = interpolation_tolerance(tolerance, np.dtype(surface.control_points.dtype))
     # The net fixes the size of the problem, so its points are not padded.
     cloud = data.reshape(-1, d)
     problem = make_problem(cloud, None, surface, unit, method.foot_tolerance, padded=False)

@@ -14,10 +14,8 @@ from jaxfit._fit._problem import Unit, unit_of
 from jaxfit._fit._results import RESULTS
 from jaxfit._fit._standard_interpolation import Solution, StandardInterpolation, solved
 from jaxfit._parameters import grid_parameters
-from jaxfit._precision import advise_x64, bucket, working_dtype
+from jaxfit._precision import bucket, interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
-
-DEFAULT_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 
 
 def standard_fit(
@@ -36,10 +34,7 @@ def standard_fit(
     concrete = is_concrete(grid)
     dtype = working_dtype() if concrete else jnp.result_type(grid, float)
     inner = unit.inward(grid).astype(dtype)
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
-    elif is_concrete(tolerance):
-        advise_x64(float(tolerance), np.dtype(dtype))
+    tolerance = interpolation_tolerance(tolerance, np.dtype(dtype))
     xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
     limits = (
         xp.asarray(unit.diagonal / unit.scale, dtype),

@@ -61,16 +61,8 @@ def surface_and_errors(
     ValueError
         If `points` is a grid whose size is not the number of errors.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(
-            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
-        ) from error
     errors = _arrange(fit.errors, points)
-    figure = Figure(figsize=(12, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(12)
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
     view = _draw_surface(left, fit.surface)
     _draw_errors(right, fit, 100 * errors, view)
@@ -165,6 +157,20 @@ def _turn_like_the_surface(axes: "Axes", surface: Any, view: View) -> None:
         axes.invert_xaxis()
     if along_v[1] < 0:
         axes.invert_yaxis()
+
+
+def blank_figure(width: int) -> "Figure":
+    """A figure of this many inches by 5.2, without pyplot."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(
+            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+        ) from error
+    figure = Figure(figsize=(width, 5.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def save(figure: "Figure", path: Path, dpi: int) -> None:

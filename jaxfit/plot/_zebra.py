@@ -10,7 +10,7 @@ import numpy as np
 from jaxfit._checks import as_direction, check_kind
 from jaxfit._quality import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
-from jaxfit.plot._picture import save
+from jaxfit.plot._picture import blank_figure, save
 from jaxfit.plot._render import coarse_points, render
 from jaxfit.plot._view import View, choose_view, view_from
 
@@ -70,18 +70,10 @@ def zebra_stripes(
     ValueError
         If there is no surface, one is not in three dimensions, or there are more or fewer captions.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(
-            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
-        ) from error
     drawn = _checked(surfaces, captions)
     camera = _camera(drawn[0], view)
     axis = camera.up if direction is None else direction
-    figure = Figure(figsize=(6 * len(drawn), 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(6 * len(drawn))
     axes = figure.subplots(1, len(drawn), squeeze=False)[0]
     for i, (surface, place) in enumerate(zip(drawn, axes, strict=True)):
         place.imshow(_striped(surface, camera, axis, stripes))
