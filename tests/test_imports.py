@@ -12,7 +12,8 @@ PACKAGE = CHECKOUT / "jaxfit"
 
 # Lowest first; a room may import its own modules and those of the lines above it.
 ROOMS = [
-    ("_checks", "_precision"),
+    ("_checks",),
+    ("_precision",),
     ("_splines",),
     ("_parameters",),
     ("_cells",),
