@@ -19,10 +19,13 @@ from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
+from jaxfit._fit import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._fit import NormalInterpolation as NormalInterpolation
 from jaxfit._fit import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit import Richardson as Richardson
 from jaxfit._fit import StandardInterpolation as StandardInterpolation
 from jaxfit._fit import UnitWeights as UnitWeights
+from jaxfit._fit import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit import approximate as approximate
 from jaxfit._fit import fit_points as fit_points
 from jaxfit._fit import interpolate as interpolate

@@ -206,9 +206,8 @@ def _traced(
         start = (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype))
     limits = (jnp.asarray(tolerance, dtype) * size, jnp.asarray(max_steps, jnp.int32))
     limits = lax.stop_gradient(limits)
-    u, v, converged, steps = foot_parameters(
-        method, net.astype(dtype), knots_u, knots_v, points, start, *limits
-    )
+    surface = (net.astype(dtype), knots_u, knots_v)
+    u, v, converged, steps = foot_parameters(method, surface, points, start, *limits)
     (point,) = evaluate_surface(net, knots_u, knots_v, u, v, ((0, 0),), False)
     square = jnp.sum((points - point) ** 2, axis=-1)
     apart = square > 0

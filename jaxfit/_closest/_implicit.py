@@ -5,14 +5,14 @@ half the squared distance. So d(u, v) = H^-1 dg, dg being taken at fixed (u, v).
 border or on a crease does not move; where H is singular nothing moves, so that nothing is ever NaN.
 """
 
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._closest._passes import Border
 from jaxfit._closest._project import project
 from jaxfit._closest._seeds import best_samples, sample
 from jaxfit._closest._steps import AbstractFootMethod
@@ -22,20 +22,35 @@ from jaxfit._splines._pieces import make_pieces
 PARTIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+Arrays = tuple[Array, Array, Array]  # control points and both knot vectors
+
+
 def foot_parameters(
     method: AbstractFootMethod,
-    control_points: Float[Array, "nu nv d"],
-    knots_u: Float[Array, " knots_u"],
-    knots_v: Float[Array, " knots_v"],
+    surface: Arrays,
     points: Float[Array, "points d"],
     start: tuple[Array, Array] | None,
     tolerance: Array,
     max_steps: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """(u, v, converged, steps); from `start`, or from the two best of a dense sample without one."""
-    centre = jnp.mean(control_points, axis=(0, 1))
-    pieces = make_pieces(control_points - centre[None, None, :], knots_u, knots_v)
+    fixed = lax.stop_gradient((surface, points, start, tolerance, max_steps))
+    u, v, converged, steps = _found(method, *fixed)
+    u, v = as_feet((u, v), surface, points, tolerance)
+    return u, v, converged, steps
+
+
+def _found(
+    method: AbstractFootMethod,
+    surface: Arrays,
+    points: Array,
+    start: tuple[Array, Array] | None,
+    tolerance: Array,
+    max_steps: Array,
+) -> tuple[Array, Array, Array, Array]:
+    net, knots_u, knots_v = surface
+    centre = jnp.mean(net, axis=(0, 1))
+    pieces = make_pieces(net - centre[None, None, :], knots_u, knots_v)
     target = (points - centre[None, :]).T
     if start is not None:
         feet = project(method, pieces, target, *start, tolerance, max_steps)
@@ -52,34 +67,53 @@ def foot_parameters(
     return nearer(feet.best_u), nearer(feet.best_v), nearer(feet.converged), nearer(feet.steps)
 
 
-@foot_parameters.defjvp
-def _foot_parameters_jvp(method: AbstractFootMethod, primals: Any, tangents: Any) -> Any:
-    net, knots_u, knots_v, points, _, tolerance, _ = primals
-    u, v, converged, steps = foot_parameters(method, *primals)
+@jax.custom_jvp
+def as_feet(
+    feet: tuple[Array, Array],
+    surface: Arrays,
+    points: Float[Array, "points d"],
+    tolerance: Array,
+    within: Border | None = None,
+) -> tuple[Array, Array]:
+    """The parameters `feet` (u, v) of `points`, known to be feet, as functions of surface and points.
 
-    def slopes(net: Array, knots_u: Array, knots_v: Array, points: Array) -> tuple[Array, Array]:
+    `within` are the bounds they are confined to, if it is not the domain.
+    """
+    return feet
+
+
+@as_feet.defjvp
+def _as_feet_jvp(primals: Any, tangents: Any) -> Any:
+    _, (net, knots_u, knots_v), points, tolerance, within = primals
+    u, v = as_feet(*primals)  # for derivatives of the derivative
+
+    def slopes(surface: Arrays, points: Array) -> tuple[Array, Array]:
         wanted = ((0, 0), (1, 0), (0, 1))
-        value, along_u, along_v = evaluate_surface(net, knots_u, knots_v, u, v, wanted, False)
+        value, along_u, along_v = evaluate_surface(*surface, u, v, wanted, False)
         e = points - value
         return jnp.sum(e * along_u, -1), jnp.sum(e * along_v, -1)
 
-    (gu, gv), (dgu, dgv) = jax.jvp(slopes, (net, knots_u, knots_v, points), tangents[:4])
+    (gu, gv), (dgu, dgv) = jax.jvp(slopes, primals[1:3], tangents[1:3])
     value, ru, rv, ruu, ruv, rvv = evaluate_surface(net, knots_u, knots_v, u, v, PARTIALS, False)
     e = points - value
     E, F, G = (jnp.sum(x * y, -1) for x, y in ((ru, ru), (ru, rv), (rv, rv)))
     a, b, c = (x - jnp.sum(e * y, -1) for x, y in ((E, ruu), (F, ruv), (G, rvv)))
-    order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
-    free_u = _free(u, gu, E, knots_u, order_u, tolerance)
-    free_v = _free(v, gv, G, knots_v, order_v, tolerance)
-    du, dv = _solve(a, b, c, E, G, dgu, dgv, free_u, free_v)
-    zero = partial(jnp.zeros, dtype=jax.dtypes.float0)
-    return (u, v, converged, steps), (du, dv, zero(converged.shape), zero(steps.shape))
+    if within is None:
+        order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
+        within = _ends(knots_u, order_u) + _ends(knots_v, order_v)
+    low_u, high_u, low_v, high_v = within
+    free_u = _free(u, gu, E, low_u, high_u, tolerance)
+    free_v = _free(v, gv, G, low_v, high_v, tolerance)
+    return (u, v), _solve(a, b, c, E, G, dgu, dgv, free_u, free_v)
 
 
-def _free(u: Array, g: Array, E: Array, knots: Array, order: int, tolerance: Array) -> Array:
-    """Whether a coordinate moves: neither pushed against a border nor, on a crease, off balance."""
-    low, high = knots[order - 1], knots[-order]
-    pushed = ((u <= low) & (g < 0)) | ((u >= high) & (g > 0))
+def _ends(knots: Array, order: int) -> tuple[Array, Array]:
+    return knots[order - 1], knots[-order]
+
+
+def _free(u: Array, g: Array, E: Array, low: Array, high: Array, tolerance: Array) -> Array:
+    """Whether a coordinate moves: not held, nor pushed against a border, nor, on a crease, off balance."""
+    pushed = ((u <= low) & (g < 0)) | ((u >= high) & (g > 0)) | (low >= high)
     scale = jnp.sqrt(jnp.finfo(u.dtype).eps)
     balanced = g * g <= (100.0 * tolerance) ** 2 * E + scale * jnp.finfo(u.dtype).tiny
     return ~pushed & balanced & (E > 0)

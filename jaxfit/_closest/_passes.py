@@ -5,6 +5,8 @@ it is in. Feet change cells, so the next pass lays them out anew; the first hold
 last ones a few stragglers.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
@@ -24,7 +26,7 @@ SLOTS_PER_BLOCK = 4096
 SHARED_FROM_POINTS = 4096
 SHARED_FROM_FILL = 2
 
-Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v
+Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v: of all points, or of each
 
 
 def settle(
@@ -78,7 +80,7 @@ def _pass(
         start, feet = carry
         part = rows.block(start, size)
         coefficients = jnp.moveaxis(pieces.coefficients[part.cell], 0, -1)[..., None]
-        box = _box(pieces, part.cell, border)
+        box = _box(pieces, part.cell, [x if x.ndim == 0 else part.spread(x[None])[0] for x in border])
         goal = part.spread(target)
         mine = Feet(part.spread(feet.real), part.spread(feet.whole))
         mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
@@ -97,7 +99,7 @@ def _pass(
     return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), feet))[1]
 
 
-def _box(pieces: Pieces, cell: Array, border: Border) -> Box:
+def _box(pieces: Pieces, cell: Array, border: Sequence[Array]) -> Box:
     """Bounds and local coordinates of cells given by number, with a last axis to broadcast along."""
     low_u, high_u, centre_u, half_u = _bounds(pieces.axis_u, cell // pieces.axis_v.cells)
     low_v, high_v, centre_v, half_v = _bounds(pieces.axis_v, cell % pieces.axis_v.cells)

@@ -23,10 +23,11 @@ def project(
     max_steps: Array,
     idle: Bool[Array, " points"] | None = None,
     borders: bool = True,
+    within: Border | None = None,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
     they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
-    of the paper).
+    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -37,9 +38,13 @@ def project(
     limits = Limits(tolerance, noise, jnp.asarray(max_steps, jnp.int32))
     axes = (pieces.axis_u, pieces.axis_v)
     u, v = (jnp.clip(x, a.breaks[0], a.breaks[-1]) for x, a in zip((u, v), axes, strict=True))
+    if within is not None:
+        u, v = jnp.clip(u, *within[:2]), jnp.clip(v, *within[2:])
     feet = new_feet(u, v)
     if idle is not None:
         feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
+    if within is not None:
+        return settle(method, pieces, target, feet, within, limits)
     if not borders:
         return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
     return _in_stages(method, pieces, target, feet, limits)

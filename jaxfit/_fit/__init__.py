@@ -1,5 +1,7 @@
 """Fits: one verb per problem, one object per method, one kind of result."""
 
+from jaxfit._fit._adjoint import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._fit._adjoint import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit._approximate import approximate as approximate
 from jaxfit._fit._approximate import fit_points as fit_points
 from jaxfit._fit._fit_result import Fit as Fit
@@ -9,6 +11,7 @@ from jaxfit._fit._frozen import Richardson as Richardson
 from jaxfit._fit._geometric_approximation import GeometricApproximation as GeometricApproximation
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit._interpolate import interpolate as interpolate
+from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation
 from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight
 from jaxfit._fit._repositioning import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit._repositioning import UnitWeights as UnitWeights

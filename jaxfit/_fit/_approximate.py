@@ -23,8 +23,8 @@ from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._loop import Carry, Limits, begin, run
-from jaxfit._fit._problem import Problem, Unit, make_problem, padded_start, unit_of
-from jaxfit._precision import advise_x64
+from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, padded_start, unit_of
+from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
 LEAST_POINTS = 4
@@ -98,8 +98,9 @@ def approximate(
             advise_x64(float(tolerance), np.dtype(base.control_points.dtype))
     unit = unit_of(cloud)
     concrete = is_concrete(cloud, base, pulls, start)
-    problem = make_problem(cloud, pulls, base, unit, method.foot_tolerance)
-    dtype, size = problem.target.dtype, problem.target.shape[1]
+    dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
+    problem = make_problem(cloud, pulls, axes_of(base, dtype), unit, method.foot_tolerance)
+    size = problem.target.shape[1]
     net = jnp.asarray(unit.inward(base.control_points), dtype)
     if start is not None:
         u, v = _checked_start(start, cloud.shape[0])

@@ -15,7 +15,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import horner
-from jaxfit._splines._pieces import Axis, Pieces
+from jaxfit._splines._pieces import Axis
 
 
 class Windows(eqx.Module):
@@ -57,10 +57,10 @@ def _coefficient(offset: Array, basis: Array, shift: int) -> Array:
     return sum(terms[1:], terms[0])
 
 
-def windows_at(pieces: Pieces, u: Float[Array, "nu nv"], v: Float[Array, "nu nv"]) -> Windows:
+def windows_at(axes: tuple[Axis, Axis], u: Float[Array, "nu nv"], v: Float[Array, "nu nv"]) -> Windows:
     """The basis functions at the parameters of every grid point."""
-    first_u, basis_u = basis_at(pieces.axis_u, u)
-    first_v, basis_v = basis_at(pieces.axis_v, v)
+    first_u, basis_u = basis_at(axes[0], u)
+    first_v, basis_v = basis_at(axes[1], v)
     return Windows(first_u, first_v, basis_u, basis_v)
 
 

@@ -82,7 +82,7 @@ class System(eqx.Module):
     windows: Windows
     target: Float[Array, "d nu nv"]
     weight: Float[Array, "nu nv"]
-    held: Bool[Array, "nu nv"]  # control points that do not move and count for no error
+    held: Bool[Any, "nu nv"]  # control points that do not move and count for no error
     lowest: Float[Array, ""]
     diagonal: Float[Array, ""]
 

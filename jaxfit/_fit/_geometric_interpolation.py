@@ -5,10 +5,11 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxfit._closest import AbstractFootMethod, Newton
+from jaxfit._fit._adjoint import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._fit._collocation import windows_at
 from jaxfit._fit._frozen import AbstractAcceleration, Richardson, System, iterate_frozen
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border, measure_feet
+from jaxfit._fit._measure import border, measure_feet, side_bounds
 from jaxfit._fit._repositioning import AbstractRepositioning, OptimalRepositioning
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
@@ -51,12 +52,28 @@ class GeometricInterpolation(AbstractIterativeMethod):
         How feet are brought up to date (default Newton).
     foot_tolerance : float
         To what tangential error, as a fraction of the diagonal.
+    keep_borders : bool, default False
+        Whether feet of the grid's border points are looked for on the border curves only. Otherwise they are
+        closest points of the whole surface, as in the paper, and may leave the border a little.
+    per_point : bool, default False
+        Whether feet start at each point's own parameters in its row and column, as in the paper, rather
+        than at the averages. What they converge to is the same unless the surface folds.
     symmetry : Reflection(), optional
         Reflectional symmetry of the surface (section 3.2). Data, parameters and knots are made symmetric
         once, which the iteration keeps: the fit meets the symmetrised data, with a symmetric net.
+    adjoint : UnrolledAdjoint() or ImplicitAdjoint()
+        What derivatives in the data mean: those of the fit as run, or those at held parameters.
     stall_window, stall_gain : int, float
         The fit stops as stalled when neither error has fallen by the share `stall_gain` within
-        `stall_window` iterations, as it does at rounding level.
+        `stall_window` iterations, as it does at rounding level. It then returns the best surface whose
+        closest points it has computed.
+
+    Notes
+    -----
+    It converges where the eigenvalues of the collocation matrix at the feet, times the weights, lie between
+    0 and 2: fast for low orders, slowly from order 6 on. It may not where rows of the grid differ so much
+    that averaged knots suit none of them, or where points repeat; `StandardInterpolation` always has a
+    solution.
     """
 
     parametrisation: AbstractParametrisation = ChordLength()
@@ -66,7 +83,10 @@ class GeometricInterpolation(AbstractIterativeMethod):
     local: bool = False
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-13
+    keep_borders: bool = False
+    per_point: bool = False
     symmetry: Reflection | None = None
+    adjoint: AbstractAdjoint = UnrolledAdjoint()
     stall_window: int = 40
     stall_gain: float = 0.1
 
@@ -79,7 +99,8 @@ class GeometricInterpolation(AbstractIterativeMethod):
         """Equations (13) and (14) once, or as often as the frozen feet allow."""
         nu, nv, _ = turn.net.shape
         target = problem.target.reshape(-1, nu, nv)
-        windows = windows_at(pieces, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
+        axes = (pieces.axis_u, pieces.axis_v)
+        windows = windows_at(axes, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
         held = border(nu, nv, corners_only=True)
         lowest = jnp.ones_like(problem.diagonal) if problem.lowest is None else problem.lowest
         weight = self.repositioning.weights(windows, lowest)
@@ -94,4 +115,5 @@ class GeometricInterpolation(AbstractIterativeMethod):
         """Closest points from the last ones."""
         nu, nv = (x.cells + k - 1 for x, k in zip((pieces.axis_u, pieces.axis_v), pieces.order, strict=True))
         corners = border(nu, nv, corners_only=True).reshape(-1)
-        return measure_feet(self.foot_method, problem, pieces, measured, corners, borders=True)
+        within = side_bounds((pieces.axis_u, pieces.axis_v), nu, nv) if self.keep_borders else None
+        return measure_feet(self.foot_method, problem, pieces, measured, corners, True, within)

@@ -206,27 +206,28 @@ def with_derivative(
     net: Array,
     parameters: tuple[Array, Array],
     knots: tuple[Array, Array],
-    tensor: TensorCollocation,
+    tensor: TensorCollocation | None,
     data: Array,
 ) -> Array:
     """`net`, with the derivative of the solution of N(parameters, knots) P = data.
 
-    That costs one solve, however the net was found.
+    That costs one solve, however the net was found; it is preconditioned by `tensor` where that is given.
     """
     return net
 
 
 @with_derivative.defjvp
 def _derivative(order: tuple[int, int], restart: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    net, parameters, knots, tensor, _ = primals
+    _, parameters, knots, tensor, _ = primals
     _, d_parameters, d_knots, _, d_data = tangents
+    net = with_derivative(order, restart, *primals)  # for derivatives of the derivative
 
     def values(parameters: tuple[Array, Array], knots: tuple[Array, Array]) -> Array:
         return point_collocation(knots, order, *parameters).times(net)
 
     _, moved = jax.jvp(values, (parameters, knots), (d_parameters, d_knots))
     system = point_collocation(knots, order, *parameters)
-    there, back = tensor.factorised(), tensor.transposed().factorised()
+    there, back = _preconditioners(tensor)
     change = lax.custom_linear_solve(
         system.times,
         d_data - moved,
@@ -234,3 +235,11 @@ def _derivative(order: tuple[int, int], restart: int, primals: tuple, tangents: 
         transpose_solve=lambda apply, b: _krylov(apply, back, b, restart),
     )
     return net, change
+
+
+def _preconditioners(tensor: TensorCollocation | None) -> tuple[Solver, Solver]:
+    """For the system and its transpose."""
+    if tensor is None:
+        return lambda x: x, lambda x: x
+    tensor = lax.stop_gradient(tensor)
+    return tensor.factorised(), tensor.transposed().factorised()

@@ -30,28 +30,28 @@ GROWTH = 1e3  # errors beyond this many times the first ones count as divergence
 class Measured(eqx.Module):
     """Feet and errors of all points on a surface. Lengths in the unit of the problem."""
 
-    u: Float[Array, " points"]
-    v: Float[Array, " points"]
-    error: Float[Array, " points"]
-    steps: Int[Array, " points"]
-    found: Bool[Array, " points"]
+    u: Float[Any, " points"]
+    v: Float[Any, " points"]
+    error: Float[Any, " points"]
+    steps: Int[Any, " points"]
+    found: Bool[Any, " points"]
 
 
 class Limits(eqx.Module):
     """When to stop. Tolerances and errors are fractions of the diagonal."""
 
-    average: Float[Array, ""]
-    maximum: Float[Array, ""]
-    max_steps: Int[Array, ""]
+    average: Float[Any, ""]
+    maximum: Float[Any, ""]
+    max_steps: Int[Any, ""]
 
 
 class Records(eqx.Module):
     """One entry for each iteration; NaN where there has been none."""
 
-    average: Float[Array, " steps"]
-    maximum: Float[Array, " steps"]
-    evaluations: Float[Array, " steps"]  # of the surface for one foot, on average
-    change: Float[Array, " steps"]  # of the feet's parameters since the iteration before, on average
+    average: Float[Any, " steps"]
+    maximum: Float[Any, " steps"]
+    evaluations: Float[Any, " steps"]  # of the surface for one foot, on average
+    change: Float[Any, " steps"]  # of the feet's parameters since the iteration before, on average
 
     def at(self, step: Array, *values: Array | float) -> "Records":
         """With the values (average, maximum, evaluations, change) of one iteration."""
@@ -68,19 +68,28 @@ class Records(eqx.Module):
 class Turn(eqx.Module):
     """A net, how many moves it took to get there, and what has been recorded on the way."""
 
-    net: Float[Array, "nu nv d"]
-    step: Int[Array, ""]
+    net: Float[Any, "nu nv d"]
+    step: Int[Any, ""]
     records: Records
+
+
+class Best(eqx.Module):
+    """The net with the smallest maximum error so far."""
+
+    net: Float[Any, "nu nv d"]
+    measured: Measured
+    maximum: Float[Any, ""]
 
 
 class Carry(eqx.Module):
     """What goes round the loop: `net` has been measured, after `step` moves; `next` has not."""
 
-    net: Float[Array, "nu nv d"]
-    step: Int[Array, ""]
+    net: Float[Any, "nu nv d"]
+    step: Int[Any, ""]
     next: Turn
     measured: Measured
-    code: Int[Array, ""]
+    code: Int[Any, ""]
+    best: Best | None  # for methods that may wander off
 
 
 class AbstractIterativeMethod(eqx.Module):
@@ -98,14 +107,16 @@ class AbstractIterativeMethod(eqx.Module):
         """One or several moves from a net that has been measured, given its pieces."""
 
 
-def begin(net: Array, u: Array, v: Array, most: int) -> Carry:
+def begin(net: Any, u: Any, v: Any, most: int, keep_best: bool = False) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries."""
-    none = jnp.zeros(u.shape, jnp.int32)
-    measured = Measured(u, v, jnp.zeros_like(u), none, none > 0)
-    empty = jnp.full(bucket(most + 1, LEAST_HISTORY), jnp.nan, net.dtype)
-    running = jnp.asarray(code_of(RESULTS.running), jnp.int32)
-    turn = Turn(net, jnp.asarray(0, jnp.int32), Records(empty, empty, empty, empty))
-    return Carry(net, jnp.asarray(-1, jnp.int32), turn, measured, running)
+    xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
+    none = xp.zeros(u.shape, np.int32)
+    measured = Measured(u, v, xp.zeros_like(u), none, none > 0)
+    empty = xp.full(bucket(most + 1, LEAST_HISTORY), np.nan, net.dtype)
+    number = partial(xp.asarray, dtype=np.int32)
+    turn = Turn(net, number(0), Records(empty, empty, empty, empty))
+    best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if keep_best else None
+    return Carry(net, number(-1), turn, measured, number(code_of(RESULTS.running)), best)
 
 
 def code_of(result: Any) -> int:
@@ -117,7 +128,13 @@ def result_of(code: Array) -> Any:
     """The item of RESULTS with this number, traced or not."""
     result: Any = RESULTS.running
     where: Any = RESULTS.where
-    for item in (RESULTS.converged, RESULTS.max_steps_reached, RESULTS.stalled, RESULTS.diverged):
+    for item in (
+        RESULTS.converged,
+        RESULTS.max_steps_reached,
+        RESULTS.stalled,
+        RESULTS.diverged,
+        RESULTS.normals_missed,
+    ):
         result = where(code == code_of(item), item, result)
     return result
 
@@ -126,7 +143,7 @@ def result_of(code: Array) -> Any:
 def advance(
     method: AbstractIterativeMethod, problem: Any, limits: Limits, until: Array, carry: Carry
 ) -> Carry:
-    """Iterate up to step `until`, or to the end."""
+    """Iterate up to step `until`, or to the end. A fit that stalls or diverges gives back its best net."""
     running = code_of(RESULTS.running)
 
     def body(carry: Carry) -> Carry:
@@ -138,13 +155,29 @@ def advance(
         code = _judge(method, limits, turn)
         move = partial(method.move, problem, limits, pieces, measured)
         following = lax.cond(code == running, move, lambda turn: turn, turn)
-        good = Carry(turn.net, turn.step, following, measured, code)
+        best = _best(carry.best, turn, measured)
+        good = Carry(turn.net, turn.step, following, measured, code, best)
         # A step into nonsense is taken back, and leaves no trace.
         back = eqx.tree_at(lambda c: c.code, carry, code)
         bad = (code == code_of(RESULTS.diverged)) & (carry.step >= 0)
         return lax.cond(bad, lambda: back, lambda: good)
 
-    return lax.while_loop(lambda c: (c.code == running) & (c.next.step <= until), body, carry)
+    end = lax.while_loop(lambda c: (c.code == running) & (c.next.step <= until), body, carry)
+    best = end.best
+    if best is None:
+        return end
+    lost = (end.code == code_of(RESULTS.stalled)) | (end.code == code_of(RESULTS.diverged))
+    net, measured = lax.cond(
+        lost & (end.step >= 0), lambda: (best.net, best.measured), lambda: (end.net, end.measured)
+    )
+    return eqx.tree_at(lambda c: (c.net, c.measured), end, (net, measured))
+
+
+def _best(best: Best | None, turn: Turn, measured: Measured) -> Best | None:
+    if best is None:
+        return None
+    maximum = turn.records.maximum[turn.step]
+    return lax.cond(maximum < best.maximum, lambda: Best(turn.net, measured, maximum), lambda: best)
 
 
 def _judge(method: AbstractIterativeMethod, limits: Limits, turn: Turn) -> Array:

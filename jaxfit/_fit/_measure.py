@@ -3,11 +3,12 @@
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Bool
 
-from jaxfit._closest import AbstractFootMethod, project
+from jaxfit._closest import AbstractFootMethod, Border, project
 from jaxfit._fit._loop import Measured
-from jaxfit._splines._pieces import Pieces
+from jaxfit._splines._pieces import Axis, Pieces
 
 FOOT_STEPS = 40
 
@@ -17,10 +18,14 @@ def measure_feet(
     problem: Any,
     pieces: Pieces,
     measured: Measured,
-    idle: Bool[Array, " points"],
+    idle: Bool[Any, " points"],
     borders: bool,
+    within: Border | None = None,
 ) -> Measured:
-    """Feet from the last ones, converged on the surface, and the errors there; `idle` points have none."""
+    """Feet from the last ones, converged on the surface, and the errors there; `idle` points have none.
+
+    `borders` and `within` are those of `project`.
+    """
     feet = project(
         method,
         pieces,
@@ -29,15 +34,31 @@ def measure_feet(
         measured.v,
         problem.foot_tolerance * problem.diagonal,
         jnp.asarray(FOOT_STEPS, jnp.int32),
-        idle,
+        jnp.asarray(idle),
         borders,
+        within,
     )
     error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
     return Measured(feet.best_u, feet.best_v, error, feet.steps, feet.converged)
 
 
-def border(nu: int, nv: int, corners_only: bool) -> Bool[Array, "nu nv"]:
+def border(nu: int, nv: int, corners_only: bool) -> Bool[np.ndarray, "nu nv"]:
     """Which control points lie on the border of the net, or only its corners."""
-    end_u = jnp.zeros(nu, bool).at[jnp.asarray([0, nu - 1])].set(True)[:, None]
-    end_v = jnp.zeros(nv, bool).at[jnp.asarray([0, nv - 1])].set(True)[None, :]
+    end_u, end_v = ends(nu)[:, None], ends(nv)[None, :]
     return end_u & end_v if corners_only else end_u | end_v
+
+
+def ends(count: int) -> Bool[np.ndarray, " count"]:
+    """The first and the last of so many."""
+    number = np.arange(count)
+    return (number == 0) | (number == count - 1)
+
+
+def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> Border:
+    """Bounds of the feet of a grid's points, such that those of border points stay on their border."""
+    bounds = []
+    for axis, number in zip(axes, (np.arange(nu)[:, None], np.arange(nv)[None, :]), strict=True):
+        low, high = axis.breaks[0], axis.breaks[-1]
+        last = number.size - 1
+        bounds += [jnp.where(number == last, high, low), jnp.where(number == 0, low, high)]
+    return tuple(jnp.broadcast_to(x, (nu, nv)).reshape(-1) for x in bounds)  # type: ignore[return-value]

@@ -17,14 +17,14 @@ from jaxfit._splines._pieces import Axis, make_axis
 class Problem(eqx.Module):
     """Points to fit, and what stays fixed while the net moves. Lengths in units of `scale`."""
 
-    target: Float[Array, "d points"]
-    weight: Float[Array, " points"]
+    target: Float[Any, "d points"]
+    weight: Float[Any, " points"]
     axis_u: Axis
     axis_v: Axis
-    padding: Float[Array, " points"]  # 1 for a point, 0 for what only fills up the size
-    diagonal: Float[Array, ""]
-    foot_tolerance: Float[Array, ""]
-    lowest: Float[Array, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
+    padding: Float[Any, " points"]  # 1 for a point, 0 for what only fills up the size
+    diagonal: Float[Any, ""]
+    foot_tolerance: Float[Any, ""]
+    lowest: Float[Any, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
 
     def summarise(self, measured: Any, before: Any) -> tuple[Array, Array, Array, Array]:
         """Of the true points: average and maximum error as fractions of the diagonal, then averages of the
@@ -84,33 +84,39 @@ def unit_of(points: Any) -> Unit:
     return Unit(0.5 * (low + high), scale, diagonal)
 
 
+def axes_of(surface: BSplineSurface, dtype: Any) -> tuple[Axis, Axis]:
+    """Both directions of a surface's knots."""
+    knots = (surface.knots_u, surface.knots_v)
+    axes = [make_axis(x.astype(dtype), order) for x, order in zip(knots, surface.order, strict=True)]
+    return axes[0], axes[1]
+
+
 def make_problem(
     points: Any,
     weights: Any,
-    surface: BSplineSurface,
+    axes: tuple[Axis, Axis],
     unit: Unit,
     foot_tolerance: float,
-    padded: bool = True,
 ) -> Problem:
     """Points in the problem's unit, padded to their bucket where they are concrete."""
     concrete = is_concrete(points, weights)
     count = points.shape[0]
     dtype = working_dtype() if concrete else jnp.result_type(points, float)
     inner = unit.inward(points)
-    size = bucket(count) if concrete and padded else count
-    xp: Any = np if concrete else jnp
+    size = bucket(count) if concrete else count
+    xp: Any = np if concrete else jnp  # NumPy's arrays cost no calls of their own
     if size > count:
         inner = np.concatenate([inner, np.repeat(inner[-1:], size - count, axis=0)])
     real = (np.arange(size) < count).astype(dtype)
     weight = real if weights is None else xp.pad(xp.asarray(weights), (0, size - count))
     return Problem(
-        target=jnp.asarray(inner.T, dtype),
-        weight=jnp.asarray(weight, dtype),
-        axis_u=make_axis(surface.knots_u.astype(dtype), surface.order[0]),
-        axis_v=make_axis(surface.knots_v.astype(dtype), surface.order[1]),
-        padding=jnp.asarray(real, dtype),
-        diagonal=jnp.asarray(unit.diagonal / unit.scale, dtype),
-        foot_tolerance=jnp.asarray(foot_tolerance, dtype),
+        target=xp.asarray(inner.T, dtype),
+        weight=xp.asarray(weight, dtype),
+        axis_u=axes[0],
+        axis_v=axes[1],
+        padding=np.asarray(real, dtype),
+        diagonal=xp.asarray(unit.diagonal / unit.scale, dtype),
+        foot_tolerance=np.asarray(foot_tolerance, dtype),
     )
 
 

@@ -13,10 +13,14 @@ class RESULTS(eqx.Enumeration):
         "or loosen the tolerances."
     )
     stalled = (
-        "the errors have stopped falling above the tolerances; loosen these or, for an approximation, use "
-        "more control points or a better base surface."
+        "the errors have stopped falling above the tolerances; loosen these, use more control points or a "
+        "better base surface for a cloud, or StandardInterpolation for a grid."
     )
     diverged = (
         "the iteration produced numbers that are not finite or errors that grow, and was taken back to the "
         "last good surface; check the base surface and the scale of the data."
+    )
+    normals_missed = (
+        "some normals lie in the surface through the points or on its other side, so that it would have to "
+        "fold; check their directions and signs."
     )

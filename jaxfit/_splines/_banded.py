@@ -19,20 +19,29 @@ UNROLL = 2  # rows per turn of a loop over right-hand sides
 
 
 def collocation_band(
-    knots: Float[Array, " knots"], order: int, u: Float[Array, " n"]
+    knots: Float[Array, " knots"],
+    order: int,
+    u: Float[Array, " parameters"],
+    derivatives: tuple[int, ...] = (0,),
 ) -> Float[Array, "n band"]:
     r"""Band of the matrix $N_{j,K}(u_i)$ for as many increasing parameters as control points.
+
+    With several `derivatives` every parameter has a row for each of them; (0, 1) is Hermite interpolation,
+    with half as many parameters as control points. They come in this order, and in the reverse order at the
+    last parameter, the right end of the domain: elimination then needs no pivoting there either.
 
     Parameters that meet the Schoenberg-Whitney condition $N_{i,K}(u_i) > 0$ have all their basis functions
     in the band; what others have outside is dropped.
     """
-    count = u.shape[0]
-    first, (weights,) = spans_and_weights(knots, order, u, (0,), False)
+    first, weights = spans_and_weights(knots, order, u, derivatives, False)
+    entries = jnp.stack([jnp.stack(each, axis=-1) for each in weights], axis=1)
+    entries = jnp.concatenate([entries[:-1], entries[-1:, ::-1]])
+    count = u.shape[0] * len(derivatives)
     row = jnp.arange(count)
-    place = (first - row + order - 1)[:, None] + jnp.arange(order)[None, :]
+    place = (jnp.repeat(first, len(derivatives)) - row + order - 1)[:, None] + jnp.arange(order)[None, :]
     place = jnp.where(place < 0, 2 * order - 1, place)  # a negative index would wrap round
-    band = jnp.zeros((count, 2 * order - 1), weights[0].dtype)
-    return band.at[row[:, None], place].set(jnp.stack(weights, axis=-1), mode="drop")
+    band = jnp.zeros((count, 2 * order - 1), entries.dtype)
+    return band.at[row[:, None], place].set(entries.reshape(count, order), mode="drop")
 
 
 def transposed(band: Float[Array, "n band"]) -> Float[Array, "n band"]:

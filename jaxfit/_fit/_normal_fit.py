@@ -1,0 +1,135 @@
+"""From a grid with normals to a Fit: units, checks, and one dispatch."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfit._checks import as_floating, is_concrete
+from jaxfit._fit._fit_result import Fit, History, sentence_of
+from jaxfit._fit._loop import code_of, result_of
+from jaxfit._fit._normal_interpolation import NormalInterpolation, NormalSolution, solved_with_normals
+from jaxfit._fit._problem import unit_of
+from jaxfit._fit._results import RESULTS
+from jaxfit._parameters import grid_parameters
+from jaxfit._precision import interpolation_tolerance, working_dtype
+from jaxfit._splines import BSplineSurface
+
+LEAST_ORDER = 3
+UNIT_TO = 1e-3  # how far from 1 the length of a normal may be
+DEFAULT_ANGLE = {"float64": 1e-9, "float32": 1e-3}
+
+
+def normal_fit(
+    method: NormalInterpolation,
+    grid: Any,
+    normals: Any,
+    order: tuple[int, int],
+    tolerance: Any,
+    throw: bool,
+) -> Fit:
+    """The whole fit of a checked grid.
+
+    Raises ValueError where normals do not belong to the grid or are no unit vectors, the order is below 3,
+    the points are not in space, or concrete data has no extent along one index.
+    """
+    directions = _checked_normals(normals, grid, order)
+    unit = unit_of(grid.reshape(-1, 3))
+    concrete = is_concrete(grid, directions)
+    dtype = working_dtype() if concrete else jnp.result_type(grid, directions, float)
+    xp: Any = np if concrete else jnp
+    inner = unit.inward(grid).astype(dtype)
+    lengths = xp.linalg.norm(directions, axis=-1, keepdims=True)
+    solution = solved_with_normals(
+        method, (int(order[0]), int(order[1])), inner, (directions / lengths).astype(dtype)
+    )
+    if concrete:
+        solution = jax.tree.map(np.asarray, solution)
+        _check(method, order, inner, solution)
+    errors = solution.residual / xp.asarray(unit.diagonal / unit.scale, dtype)
+    average, maximum, angle = xp.mean(errors), xp.max(errors), xp.max(solution.angles)
+    u, v = solution.parameters
+    shape = errors.shape
+    angle_limit = DEFAULT_ANGLE[dtype.name] if method.normal_tolerance is None else method.normal_tolerance
+    net = unit.outward(solution.net).astype(dtype)
+    result = _ending(maximum, interpolation_tolerance(tolerance, dtype), angle, angle_limit, net, throw)
+    once = xp.zeros(1, dtype)
+    history = History(average[None] + once, maximum[None] + once, once, once)
+    parts = [xp.broadcast_to(u[:, None], shape), xp.broadcast_to(v[None, :], shape), errors, average, maximum]
+    if concrete:
+        parts, history = jax.device_put((parts, history))
+    stats = {
+        "num_steps": np.int32(0),
+        "diagonal": unit.diagonal,
+        "unconverged_feet": np.int32(0),
+        "normal_errors": solution.angles,
+        "maximum_normal_error": angle,
+    }
+    return Fit(
+        surface=BSplineSurface(net, *solution.knots),
+        u=parts[0],
+        v=parts[1],
+        errors=parts[2],
+        average_error=parts[3],
+        maximum_error=parts[4],
+        history=history,
+        result=result,
+        stats=stats,
+    )
+
+
+def _checked_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    if normals is None:
+        raise ValueError(
+            "normals must be given for NormalInterpolation; pass unit vectors in the shape of the grid."
+        )
+    directions = as_floating("normals", normals, 3)
+    if grid.shape[2] != 3 or directions.shape != grid.shape:
+        raise ValueError(
+            f"normals must hold one vector in space for each point of the grid, but their shapes are "
+            f"{directions.shape} and {grid.shape}; give two arrays (n, m, 3)."
+        )
+    if min(order) < LEAST_ORDER:
+        raise ValueError(
+            f"order must be at least {LEAST_ORDER} in each direction to meet normals, but is {tuple(order)}; "
+            "raise it."
+        )
+    if is_concrete(directions):
+        lengths = np.linalg.norm(np.asarray(directions), axis=-1)
+        worst = np.unravel_index(np.argmax(np.abs(lengths - 1)), lengths.shape)
+        if abs(lengths[worst] - 1) > UNIT_TO:
+            raise ValueError(
+                f"normals must be unit vectors, but the one at {tuple(int(i) for i in worst)} has length "
+                f"{lengths[worst]:.3g}; divide each by its length."
+            )
+    return directions
+
+
+def _check(method: NormalInterpolation, order: tuple[int, int], inner: Any, solution: NormalSolution) -> None:
+    """Raise where a grid has no parameters, so that the traced part made some up, or no solution."""
+    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
+    if (solution.extent <= noise).any():
+        grid_parameters(inner, method.parametrisation)
+    if not np.isfinite(solution.net).all():
+        raise ValueError(
+            f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
+            "matrix is singular to rounding; lower the order, or remove points that repeat."
+        )
+
+
+def _ending(maximum: Any, tolerance: Any, angle: Any, angle_limit: float, net: Any, throw: bool) -> Any:
+    """Why the fit ended; raises the sentence if `throw` and it has not converged."""
+    if is_concrete(maximum, tolerance, angle):
+        result = RESULTS.normals_missed if angle > angle_limit else RESULTS.converged
+        result = RESULTS.stalled if maximum > float(tolerance) else result
+        if throw and result != RESULTS.converged:
+            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
+        return result
+    code = jnp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
+    code = jnp.where(maximum > tolerance, code_of(RESULTS.stalled), code)
+    result = result_of(jnp.where(jnp.isfinite(maximum), code, code_of(RESULTS.diverged)))
+    if throw:
+        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
+    return result
