@@ -185,13 +185,92 @@ def test_hostile_grids_end_with_finite_numbers_and_a_reason(case):
     assert bool(fit.converged) == (float(fit.maximum_error) <= 1e-12)
 
 
-def test_vmap_inside_jit_gives_the_same_as_plain_calls():
+@pytest.mark.parametrize("method", [jf.GeometricInterpolation(), jf.StandardInterpolation()])
+def test_a_batch_of_grids_is_a_loop_over_them(method):
     def net(grid):
-        return jf.interpolate(grid, tolerance=1e-9).surface.control_points
+        return jf.interpolate(grid, method, tolerance=1e-9).surface.control_points
 
-    both = jax.jit(jax.vmap(net))(jnp.stack([jnp.asarray(GRID), jnp.asarray(2 * GRID[::-1])]))
-    assert np.abs(np.asarray(both[0]) - np.asarray(net(GRID))).max() < 1e-12
-    assert np.abs(np.asarray(both[1]) - np.asarray(net(2 * GRID[::-1]))).max() < 1e-12
+    noise = np.random.default_rng(5).normal(scale=5e-3, size=(32, *GRID.shape))
+    grids = np.linspace(0.1, 3.0, 32)[:, None, None, None] * (GRID[None] + noise)
+    nets = jax.jit(jax.vmap(net))(grids)
+    for each, grid in zip(nets, grids, strict=True):
+        assert np.abs(np.asarray(each) - np.asarray(net(grid))).max() < 1e-12
+
+
+EVERY_CHOICE = jf.GeometricInterpolation(
+    repositioning=jf.ConstantWeight(),
+    acceleration=jf.Chebyshev(),
+    freeze_after=3,
+    keep_borders=True,
+    symmetry=jf.Reflection(axis=1, normal=np.array([0.0, 1.0, 0.0])),
+    local=True,
+)
+
+
+@pytest.mark.parametrize(
+    ("method", "order"),
+    [(jf.GeometricInterpolation(), (3, 5)), (EVERY_CHOICE, (4, 4))],
+    ids=["usual", "every"],
+)
+def test_derivatives_are_those_of_finite_differences(method, order):
+    rng = np.random.default_rng(3)
+    grid = wavy_grid(7, 9) + rng.normal(scale=5e-3, size=(7, 9, 3))
+    pull, way = rng.normal(size=(2, 7, 9, 3))
+
+    @jax.jit
+    @jax.value_and_grad
+    def value(grid):
+        net = jf.interpolate(grid, method, order=order, tolerance=1e-14).surface.control_points
+        return jnp.sum(pull * net)
+
+    slope = float(np.sum(np.asarray(value(grid)[1]) * way))
+    h = 2e-6  # feet that leave the border make kinks
+    near, far = (float(value(grid + k * h * way)[0] - value(grid - k * h * way)[0]) for k in (1, 2))
+    difference = (8 * near - far) / (12 * h)
+    assert abs(slope - difference) <= 1e-6 * abs(difference)
+
+
+def test_the_implicit_derivative_holds_the_parameters():
+    def net(grid):
+        method = jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint())
+        return jf.interpolate(grid, method, tolerance=1e-13).surface.control_points
+
+    way = np.random.default_rng(1).normal(size=GRID.shape)
+    _, change = jax.jvp(net, (jnp.asarray(GRID),), (jnp.asarray(way),))
+    fit = jf.interpolate(GRID, tolerance=1e-13)
+    # The same parameters and knots, at which the data moves.
+    moved = jf.BSplineSurface(change, fit.surface.knots_u, fit.surface.knots_v)
+    np.testing.assert_allclose(np.asarray(moved(fit.u, fit.v)), way, atol=1e-9)
+
+
+def test_border_points_can_be_kept_on_the_border():
+    grid = GRID + np.random.default_rng(2).normal(scale=1e-2, size=GRID.shape)
+    fit = jf.interpolate(grid, jf.GeometricInterpolation(keep_borders=True))
+    assert bool(fit.converged), fit.message
+    u, v = np.asarray(fit.u), np.asarray(fit.v)
+    for x, low, high in ((u, u[0], u[-1]), (v, v[:, 0], v[:, -1])):
+        assert (low == x.min()).all()
+        assert (high == x.max()).all()
+    assert np.abs(np.asarray(fit.surface(u, v)) - grid).max() <= 5e-12 * diagonal(grid)
+    free = jf.interpolate(grid)
+    assert (np.asarray(free.u)[0] > 0).any()
+
+
+def test_feet_may_start_at_parameters_of_their_own():
+    fit = jf.interpolate(GRID, jf.GeometricInterpolation(per_point=True))
+    assert bool(fit.converged), fit.message
+    net, usual = fit.surface.control_points, jf.interpolate(GRID).surface.control_points
+    assert np.abs(np.asarray(net) - np.asarray(usual)).max() <= 1e-10
+
+
+def test_a_fit_that_grows_gives_back_the_best_surface_it_measured():
+    grid = np.random.default_rng(0).normal(size=GRID.shape)  # no surface at all
+    fit = jf.interpolate(grid, PLAIN, max_steps=300)
+    assert fit.result == jf.RESULTS.stalled
+    assert float(fit.maximum_error) < fit.history.maximum[-1]
+    assert float(fit.maximum_error) == float(np.nanmin(np.asarray(fit.history.maximum)))
+    at = np.asarray(fit.surface(fit.u, fit.v))
+    np.testing.assert_allclose(np.linalg.norm(at - grid, axis=-1) / diagonal(grid), fit.errors, atol=1e-12)
 
 
 def test_progress_reports_and_changes_nothing():

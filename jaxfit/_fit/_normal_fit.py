@@ -56,10 +56,10 @@ def normal_fit(
     net = unit.outward(solution.net).astype(dtype)
     result = _ending(maximum, interpolation_tolerance(tolerance, dtype), angle, angle_limit, net, throw)
     once = xp.zeros(1, dtype)
-    history = History(average[None] + once, maximum[None] + once, once, once)
+    entries = [average[None] + once, maximum[None] + once, once, once]
     parts = [xp.broadcast_to(u[:, None], shape), xp.broadcast_to(v[None, :], shape), errors, average, maximum]
     if concrete:
-        parts, history = jax.device_put((parts, history))
+        parts, entries = jax.device_put((parts, entries))
     stats = {
         "num_steps": np.int32(0),
         "diagonal": unit.diagonal,
@@ -74,7 +74,7 @@ def normal_fit(
         errors=parts[2],
         average_error=parts[3],
         maximum_error=parts[4],
-        history=history,
+        history=History(*entries),
         result=result,
         stats=stats,
     )
