@@ -1,10 +1,10 @@
 """Standard interpolation of grids beside SciPy's two passes of `make_interp_spline`, in one run.
 
-    python benchmarks/standard_interpolation.py [--runs 40] [--data FOLDER]
+    python benchmarks/standard_interpolation.py [--turns 5] [--runs 20] [--data FOLDER]
 
 Median times with the lowest and the highest, and the first call, which compiles. SciPy gets parameters and
-knots for nothing; ours include them, the checks and the errors. Runs alternate, so that both meet the same
-machine.
+knots for nothing; ours include them, the checks and the errors. They take turns, so that both meet the
+same machine, several runs each, so that both find their data in the caches.
 """
 
 import argparse
@@ -59,7 +59,8 @@ def row(name, first, times, note=""):
 def main():
     parser = argparse.ArgumentParser(description="standard interpolation of grids")
     parser.add_argument("--data", type=Path, default=helpers.FOLDER)
-    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--turns", type=int, default=5)
+    parser.add_argument("--runs", type=int, default=20, help="in each turn")
     options = parser.parse_args()
     print(f"jax {jax.__version__}, {jax.default_backend()}, float64, order (4, 4)")
     for n, m in SIZES:
@@ -78,7 +79,9 @@ def main():
             return make_interp_spline(v, half, 3, t=knots_v, axis=1).c
 
         their_first, net = seconds(theirs)
-        times = np.array([(seconds(ours)[0], seconds(theirs)[0]) for _ in range(options.runs)])
+        turns = [work for _ in range(options.turns) for work in (ours, theirs)]
+        spent = [[seconds(work)[0] for _ in range(options.runs)] for work in turns]
+        times = np.array([np.ravel(spent[0::2]), np.ravel(spent[1::2])]).T
         apart = np.abs(np.asarray(fit.surface.control_points) - net.swapaxes(0, 1)).max()
         note = f"error {float(fit.maximum_error):.1e}, from SciPy {apart / helpers.diagonal(grid):.1e}"
         row(f"{name}, jaxfit", first, times[:, 0], note)

@@ -11,7 +11,12 @@ from jax.typing import ArrayLike
 
 def is_concrete(*trees: Any) -> bool:
     """Whether no leaf of `trees` is a tracer, so that values may be looked at."""
-    return not any(isinstance(x, jax.core.Tracer) for x in jax.tree_util.tree_leaves(trees))
+    for tree in trees:
+        # Most are single arrays, for which the detour through a tree takes ten times as long.
+        leaves = (tree,) if isinstance(tree, (np.ndarray, jax.Array)) else jax.tree_util.tree_leaves(tree)
+        if any(isinstance(x, jax.core.Tracer) for x in leaves):
+            return False
+    return True
 
 
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:

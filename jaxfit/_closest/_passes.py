@@ -18,10 +18,13 @@ from jaxfit._closest._feet import ARRIVED, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
+# Where rows hold a single point, laying feet out anew costs less than moving some that have arrived.
 STEPS_PER_PASS = 3
+STEPS_ALONE = 1
 # On a CPU, what a block computes stays in the caches, and is too little to be shared among cores, which costs
 # more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
 SLOTS_PER_BLOCK = 4096
+ROWS_PER_BLOCK = 2048
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096
 SHARED_FROM_FILL = 2
@@ -74,7 +77,9 @@ def _pass(
 ) -> Feet:
     """A few steps for every foot in a row."""
     count, width = rows.point.shape
-    size = min(count, SLOTS_PER_BLOCK // width) if jax.default_backend() == "cpu" else count
+    steps = STEPS_PER_PASS if width > 1 else STEPS_ALONE
+    on_cpu = jax.default_backend() == "cpu"
+    size = min(count, SLOTS_PER_BLOCK // width, ROWS_PER_BLOCK) if on_cpu else count
 
     def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         start, feet = carry
@@ -86,7 +91,7 @@ def _pass(
         mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
 
         def unfinished(carry: tuple[Array, Feet]) -> Array:
-            return (carry[0] < STEPS_PER_PASS) & jnp.any(is_going(carry[1], limits))
+            return (carry[0] < steps) & jnp.any(is_going(carry[1], limits))
 
         def step(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
             return carry[0] + 1, advance(method, carry[1], goal, coefficients, box, limits)

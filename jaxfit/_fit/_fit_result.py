@@ -84,7 +84,8 @@ def history_of(carry: Carry) -> History:
     if is_concrete(carry):
         end = int(carry.step) + 1
         # Cut by NumPy: by JAX, every new length would be a new compilation.
-        return History(*(jax.device_put(np.asarray(x)[:end]) for x in jax.tree.leaves(carry.next.records)))
+        columns = [np.asarray(x)[:end] for x in jax.tree.leaves(carry.next.records)]
+        return History(*jax.device_put(columns))
     return History(*jax.tree.leaves(carry.next.records))
 
 

@@ -151,7 +151,7 @@ def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, thr
     parts = [measured.u.reshape(n, m), measured.v.reshape(n, m), errors.reshape(n, m)]
     parts = [*parts, xp.mean(errors), xp.max(errors)]
     if concrete:
-        parts = [jax.device_put(np.asarray(x, net.dtype)) for x in parts]
+        parts = jax.device_put([np.asarray(x, net.dtype) for x in parts])
     return Fit(
         surface=BSplineSurface(points, *knots),
         u=parts[0],

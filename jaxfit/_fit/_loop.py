@@ -128,13 +128,16 @@ def result_of(code: Array) -> Any:
     """The item of RESULTS with this number, traced or not."""
     result: Any = RESULTS.running
     where: Any = RESULTS.where
-    for item in (
+    ends = (
         RESULTS.converged,
         RESULTS.max_steps_reached,
         RESULTS.stalled,
         RESULTS.diverged,
         RESULTS.normals_missed,
-    ):
+    )
+    if is_concrete(code):
+        return next((item for item in ends if code_of(item) == int(code)), RESULTS.running)
+    for item in ends:
         result = where(code == code_of(item), item, result)
     return result
 

@@ -4,6 +4,7 @@ import operator
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -39,9 +40,9 @@ def checked_net(control_points: ArrayLike, knots: dict[str, ArrayLike]) -> tuple
             )
         check_knots(name, vector, order, count)
     # asarray first: it follows the session's precision without a warning, astype would warn.
-    arrays = [jnp.asarray(x) for x in (net, *vectors.values())]
+    arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in (net, *vectors.values())]
     dtype = jnp.result_type(*arrays)
-    net, *rest = (x.astype(dtype) for x in arrays)
+    net, *rest = (x if x.dtype == dtype else x.astype(dtype) for x in arrays)
     return net, dict(zip(vectors, rest, strict=True))
 
 
