@@ -10,6 +10,7 @@ from jaxfit._cells._polynomials import evaluate_values as evaluate_values
 from jaxfit._cells._polynomials import horner as horner
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows
+from jaxfit._cells._rows import make_single_rows as make_single_rows
 from jaxfit._cells._rows import row_width as row_width
 from jaxfit._cells._stage import staged as staged
 from jaxfit._cells._sums import net_sums as net_sums

@@ -68,6 +68,19 @@ def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
     return Rows(owner, table.reshape(count, width), until[1, cells - 1], points)
 
 
+def make_single_rows(cell: Int[Array, " points"], cells: int) -> Rows:
+    """A row for each point that takes part, in the points' own order: no sorting, but no cell is shared."""
+    points = cell.shape[0]
+    taken = cell < cells
+    until = jnp.cumsum(taken, dtype=jnp.int32)
+    number = jnp.arange(points, dtype=jnp.int32)
+    table = (
+        jnp.full(points, points, jnp.int32).at[jnp.where(taken, until - 1, points)].set(number, mode="drop")
+    )
+    owner = jnp.minimum(cell[jnp.minimum(table, points - 1)], cells - 1)
+    return Rows(owner, table[:, None], until[points - 1], points)
+
+
 def sort_by_cell(
     cell: Int[Array, " points"], cells: int
 ) -> tuple[Int[Array, " points"], Int[Array, " points"]]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import Rows, make_rows, row_width
+from jaxfit._cells import Rows, make_rows, make_single_rows, row_width
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
 from jaxfit._closest._feet import ARRIVED, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
@@ -63,7 +63,7 @@ def settle(
 def _rows(cell: Array, cells: int) -> Rows:
     points = cell.shape[0]
     shared = points >= SHARED_FROM_POINTS and points >= SHARED_FROM_FILL * cells
-    return make_rows(cell, cells, row_width(points, cells) if shared else 1)
+    return make_rows(cell, cells, row_width(points, cells)) if shared else make_single_rows(cell, cells)
 
 
 def _pass(

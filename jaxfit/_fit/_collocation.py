@@ -1,9 +1,9 @@
 """The collocation system of a grid at given parameters: every point's own few basis functions.
 
-For a net with one control point for each data point, (N P)_ij = R(u_ij, v_ij). As long as every foot stays in
-the support of the basis functions of its own control point, N reaches no farther than K - 1 rows and L - 1
-columns from it, and N P is a fixed stencil: a sum of shifted copies of the net, each times an array of
-coefficients, with no gather.
+For a net with one control point for each data point, (N P)_ij = R(u_ij, v_ij). Feet of interior points stay
+close to their control points, so that there N reaches no farther than K - 2 rows and L - 2 columns from them,
+and N P is a fixed stencil: a sum of shifted copies of the net, each times an array of coefficients, with no
+gather. The border's few points fetch their own.
 """
 
 from typing import Any
@@ -38,11 +38,19 @@ class Windows(eqx.Module):
         number = jnp.arange(self.first_v.shape[1], dtype=jnp.int32)[None, :]
         return self.first_v - number + self.basis_v.shape[0] - 1
 
-    def is_local(self) -> Bool[Array, ""]:
-        """Whether every foot lies in the support of its own control point's basis functions."""
-        parts = ((self.offset_u, self.basis_u), (self.offset_v, self.basis_v))
-        inside = [jnp.all((offset >= 0) & (offset < basis.shape[0])) for offset, basis in parts]
+    def is_close(self) -> Bool[Array, ""]:
+        """Whether the interior feet are so close to their control points that the stencil is right."""
+        parts = ((self.offset_u, self.basis_u.shape[0]), (self.offset_v, self.basis_v.shape[0]))
+        inside = [
+            jnp.all((offset >= margin(order)) & (offset < order - margin(order)))
+            for offset, order in ((offset[1:-1, 1:-1], order) for offset, order in parts)
+        ]
         return inside[0] & inside[1]
+
+    def part(self, rows: Any, columns: Any) -> "Windows":
+        """Those of some of the points, given as slices."""
+        first_u, first_v = (x[rows, columns] for x in (self.first_u, self.first_v))
+        return Windows(first_u, first_v, self.basis_u[:, rows, columns], self.basis_v[:, rows, columns])
 
     def own(self) -> tuple[Float[Array, "nu nv"], Float[Array, "nu nv"]]:
         """N_i(u_ij) and N_j(v_ij), zero outside their support."""
@@ -75,8 +83,14 @@ def basis_at(axis: Axis, u: Float[Array, "..."]) -> tuple[Int[Array, "..."], Flo
     return cell, jnp.stack(values)
 
 
+def margin(order: int) -> int:
+    """How many of the K windows that hold a control point's own function the stencil does without, either
+    side."""
+    return 1 if order > 2 else 0
+
+
 class Stencil(eqx.Module):
-    """N as shifts of the net: coefficients for the shifts -(K - 1) ... K - 1 and -(L - 1) ... L - 1."""
+    """N as shifts of the net, with coefficients for the shifts of -r ... r rows and of -s ... s columns."""
 
     along_u: Float[Array, "shifts_u nu nv"]
     along_v: Float[Array, "shifts_v nu nv"]
@@ -95,12 +109,24 @@ class Stencil(eqx.Module):
 
 
 def stencil_of(windows: Windows) -> Stencil:
-    """The stencil; right only where `windows.is_local()`."""
+    """The stencil; right only for interior points, and where `windows.is_close()`."""
     return Stencil(_shifted(windows.offset_u, windows.basis_u), _shifted(windows.offset_v, windows.basis_v))
 
 
 def _shifted(offset: Array, basis: Array) -> Array:
-    return jnp.stack([_coefficient(offset, basis, shift) for shift in range(2 * basis.shape[0] - 1)])
+    least = margin(basis.shape[0])
+    shifts = range(least, 2 * basis.shape[0] - 1 - least)
+    return jnp.stack([_coefficient(offset, basis, shift) for shift in shifts])
+
+
+def applied(windows: Windows, stencil: Stencil, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+    """R at every foot: the interior by the stencil, the border's points one by one."""
+    inner = slice(1, -1)
+    values = stencil(net)
+    for end in (slice(0, 1), slice(-1, None)):
+        values = values.at[:, end].set(gathered(windows.part(end, slice(None)), net))
+        values = values.at[:, inner, end].set(gathered(windows.part(inner, end), net))
+    return values
 
 
 def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:

@@ -1,6 +1,7 @@
 """Geometric interpolation with the feet held: a linear fixed-point iteration on the net (section 3.3.1)."""
 
 from abc import abstractmethod
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,7 +11,7 @@ from equinox import AbstractClassVar
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._fit._collocation import Windows, gathered, stencil_of
+from jaxfit._fit._collocation import Windows, applied, gathered, stencil_of
 from jaxfit._fit._loop import GROWTH, Limits, Records, Turn
 
 
@@ -93,13 +94,15 @@ def iterate_frozen(method: Any, limits: Limits, system: System, most: Array, tur
     Records the errors at the held feet. Unless `most` ended it, the net it ends with has been recorded.
     """
     stencil, windows = stencil_of(system.windows), system.windows
-    local = windows.is_local()
+    close = windows.is_close()
     last = turn.step + most
     acceleration: AbstractAcceleration = method.acceleration
 
     def body(x: tuple[Array, Array, Array, Records, Any]) -> tuple[Array, Array, Array, Records, Any]:
         _, net, step, records, state = x
-        e = system.target - lax.cond(local, lambda x: stencil(x), lambda x: gathered(windows, x), net)
+        e = system.target - lax.cond(
+            close, partial(applied, windows, stencil), partial(gathered, windows), net
+        )
         square: Any = sum(e[1:] ** 2, e[0] ** 2)
         error = jnp.where(system.held, 0.0, jnp.sqrt(square)) / system.diagonal
         average, maximum = jnp.mean(error), jnp.max(error)
