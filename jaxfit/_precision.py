@@ -25,13 +25,19 @@ def default_foot_tolerance(dtype: np.dtype) -> float:
     return DEFAULT_FOOT_TOLERANCE.get(np.dtype(dtype).name, 1e-5)
 
 
-def interpolation_tolerance(tolerance: Any, dtype: np.dtype) -> Any:
-    """The tolerance asked for, with advice where this precision cannot meet it; or the default."""
+def interpolation_tolerance(tolerance: Any, dtype: np.dtype, least: Any) -> tuple[Any, Any]:
+    """What an interpolation is to reach, and what it may have after its net is rounded.
+
+    Both are the tolerance asked for, with advice where this precision cannot meet it. By default they are
+    the usual one, or about the `least` that the data permits where that is more.
+    """
     if tolerance is None:
-        return DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
+        usual = DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
+        greater: Any = np.maximum if is_concrete(least) else jnp.maximum
+        return greater(usual, 0.5 * least), greater(usual, least)
     if is_concrete(tolerance):
         advise_x64(float(tolerance), np.dtype(dtype), stacklevel=4)
-    return tolerance
+    return tolerance, tolerance
 
 
 def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 3) -> None:

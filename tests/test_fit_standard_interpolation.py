@@ -120,8 +120,12 @@ def test_hostile_grids_are_met_at_rounding_level(case):
     grid = hostile(case)
     fit = jf.interpolate(grid, STANDARD)
     assert np.isfinite(np.asarray(fit.surface.control_points)).all()
-    size = np.abs(np.asarray(fit.surface.control_points) - grid.mean((0, 1))).max() / diagonal(grid)
-    assert float(fit.maximum_error) <= 100 * eps() * max(size, 1)
+    net = np.asarray(fit.surface.control_points)
+    size = np.abs(net - grid.mean((0, 1))).max() / diagonal(grid)
+    rounding = np.abs(net).max() / diagonal(grid)  # of the net, far from the origin
+    assert float(fit.maximum_error) <= eps() * (100 * max(size, 1) + rounding)
+    if case == "far away":
+        assert float(fit.maximum_error) >= 0.1 * eps() * rounding
 
 
 def constant_along_first():
@@ -160,7 +164,8 @@ def test_every_point_can_keep_its_own_parameters():
     assert np.abs(np.asarray(fit.u) - own.rows_u).max() < 1e-15
     assert np.abs(np.asarray(fit.surface(fit.u, fit.v)) - SHEARED).max() < 1e-12
     assert len(fit.history.maximum) == int(fit.stats["num_steps"]) + 1
-    assert float(fit.history.maximum[-1]) == float(fit.maximum_error) == float(fit.errors.max())
+    assert float(fit.maximum_error) == float(fit.errors.max())
+    assert abs(float(fit.history.maximum[-1]) - float(fit.maximum_error)) <= 2 * eps()
 
 
 def test_derivatives_with_a_parameter_pair_for_every_point():

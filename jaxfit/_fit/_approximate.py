@@ -165,7 +165,7 @@ def _finished(
         average_error=jnp.asarray(xp.mean(parts[2])),
         maximum_error=jnp.asarray(xp.max(parts[2])),
         history=history_of(carry),
-        result=outcome(carry, throw),
+        result=outcome(carry.code, carry.net, throw),
         stats={
             "num_steps": carry.step,
             "diagonal": unit.diagonal,

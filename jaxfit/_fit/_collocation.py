@@ -129,8 +129,8 @@ def applied(windows: Windows, stencil: Stencil, net: Float[Array, "d nu nv"]) ->
     return values
 
 
-def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
-    """R at every foot, wherever it is: each fetches its own control points."""
+def gathered(windows: Windows, net: Float[Array, "d nu nv"]) -> Float[Array, "d rows columns"]:
+    """R at every foot of the windows, wherever it is: each fetches its own control points."""
     d, _, nv = net.shape
     first = windows.first_u * nv + windows.first_v
     values = []

@@ -89,14 +89,15 @@ def history_of(carry: Carry) -> History:
     return History(*jax.tree.leaves(carry.next.records))
 
 
-def outcome(carry: Carry, throw: bool) -> Any:
-    """The result; raises its sentence instead if `throw` and the fit has not converged."""
-    result = result_of(carry.code)
-    if throw and is_concrete(carry):
+def outcome(code: Any, net: Any, throw: bool) -> Any:
+    """The result with this number; raises its sentence instead if `throw` and the fit has not converged.
+
+    Inside transformations nothing can be raised but by what depends on `net`.
+    """
+    result = result_of(code)
+    if throw and is_concrete(code):
         if not bool(result == RESULTS.converged):
             raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
     elif throw:
-        _, result = eqx.error_if(
-            (carry.net, result), result != RESULTS.converged, "the fit did not converge."
-        )
+        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
     return jax.tree.map(lambda x: x, result)

@@ -15,10 +15,11 @@ from jaxfit._checks import is_concrete
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._interpolation_derivative import Found, Setting, followed
-from jaxfit._fit._loop import Carry, Limits, begin, run
+from jaxfit._fit._loop import Carry, Limits, begin, code_of, run
 from jaxfit._fit._measure import border
 from jaxfit._fit._problem import Problem, Unit, unit_of
 from jaxfit._fit._repositioning import lowest_eigenvalue
+from jaxfit._fit._results import RESULTS
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface, Reflection, averaging_knots
@@ -82,15 +83,16 @@ def geometric_fit(
     start = started(method, order, None if symmetry is None else symmetry.axis, inner)
     if concrete:
         start = jax.tree.map(np.asarray, start)
-        _check(method, inner, start)
-    setting = _setting(method, inner, start, unit, interpolation_tolerance(tolerance, dtype))
+        _check(method, inner, start, symmetry)
+    goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
+    setting = _setting(method, inner, start, unit, goal)
     fixed = lax.stop_gradient(setting) if not concrete else setting
     carry, problem = _iterated(method, order, fixed, max_steps, progress)
     if symmetry is not None:
         net = symmetry.symmetrise_points(carry.net)
         carry = eqx.tree_at(lambda c: c.net, carry, net if concrete else lax.stop_gradient(net))
     if concrete:
-        return _fit(carry, problem, unit, grid, start.knots, throw)
+        return _fit(carry, problem, unit, grid, start.knots, tolerance, throw)
     measured = carry.measured
     n, m, _ = grid.shape
     found = Found(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
@@ -98,13 +100,18 @@ def geometric_fit(
     carry = eqx.tree_at(lambda c: c.net, carry, found.net)
     feet = found.u.reshape(-1), found.v.reshape(-1)
     carry = eqx.tree_at(lambda c: (c.measured.u, c.measured.v), carry, feet)
-    return _fit(carry, problem, unit, grid, start.knots, throw)
+    return _fit(carry, problem, unit, grid, start.knots, tolerance, throw)
 
 
-def _check(method: GeometricInterpolation, inner: Any, start: Start) -> None:
+def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: Reflection | None) -> None:
     """Raise where a grid has no parameters, so that the traced part made some up."""
     noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
     increasing = all((np.diff(x) > 0).all() for x in start.averaged)
+    if symmetry is not None and (start.extent <= noise).any():
+        raise ValueError(
+            f"symmetry leaves the grid no extent along one index, since it pairs points along axis="
+            f"{symmetry.axis} that are no mirror images; pair the other index, or give the normal."
+        )
     if not increasing or (start.extent <= noise).any():
         grid_parameters(inner, method.parametrisation)
 
@@ -137,7 +144,9 @@ def _iterated(
     return run(method, problem, limits, carry, progress if is_concrete(setting) else None), problem
 
 
-def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, throw: bool) -> Fit:
+def _fit(
+    carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any, throw: bool
+) -> Fit:
     n, m, _ = grid.shape
     concrete = is_concrete(carry, grid)
     xp: Any = np if concrete else jnp
@@ -146,7 +155,9 @@ def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, thr
     corners = border(n, m, corners_only=True)[..., None]
     net = xp.asarray(carry.net)
     points = xp.where(corners, grid, unit.outward(net)).astype(net.dtype)
-    errors = measured.error / problem.diagonal
+    errors = measured.error / problem.diagonal + lax.stop_gradient(unit.loss(net, points))
+    missed = (carry.code == code_of(RESULTS.converged)) & (xp.max(errors) > tolerance)
+    code = xp.where(missed, np.int32(code_of(RESULTS.rounded)), carry.code)
     lost = xp.sum(~measured.found)
     parts = [measured.u.reshape(n, m), measured.v.reshape(n, m), errors.reshape(n, m)]
     parts = [*parts, xp.mean(errors), xp.max(errors)]
@@ -160,6 +171,6 @@ def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, thr
         average_error=parts[3],
         maximum_error=parts[4],
         history=history_of(carry),
-        result=outcome(carry, throw),
+        result=outcome(code, carry.net, throw),
         stats={"num_steps": carry.step, "diagonal": unit.diagonal, "unconverged_feet": lost},
     )

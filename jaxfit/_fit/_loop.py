@@ -124,7 +124,7 @@ def code_of(result: Any) -> int:
     return int(np.asarray(result._value))
 
 
-def result_of(code: Array) -> Any:
+def result_of(code: Any) -> Any:
     """The item of RESULTS with this number, traced or not."""
     result: Any = RESULTS.running
     where: Any = RESULTS.where
@@ -133,6 +133,7 @@ def result_of(code: Array) -> Any:
         RESULTS.max_steps_reached,
         RESULTS.stalled,
         RESULTS.diverged,
+        RESULTS.rounded,
         RESULTS.normals_missed,
     )
     if is_concrete(code):

@@ -2,14 +2,14 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxfit._checks import as_floating, is_concrete
-from jaxfit._fit._fit_result import Fit, History, sentence_of
-from jaxfit._fit._loop import code_of, result_of
+from jaxfit._fit._fit_result import Fit, History, outcome
+from jaxfit._fit._loop import code_of
 from jaxfit._fit._normal_interpolation import NormalInterpolation, NormalSolution, solved_with_normals
 from jaxfit._fit._problem import unit_of
 from jaxfit._fit._results import RESULTS
@@ -48,13 +48,14 @@ def normal_fit(
     if concrete:
         solution = jax.tree.map(np.asarray, solution)
         _check(method, order, inner, solution)
-    errors = solution.residual / xp.asarray(unit.diagonal / unit.scale, dtype)
+    net = unit.outward(solution.net).astype(dtype)
+    loss = lax.stop_gradient(unit.loss(solution.net, net))
+    errors = solution.residual / xp.asarray(unit.diagonal / unit.scale, dtype) + loss
     average, maximum, angle = xp.mean(errors), xp.max(errors), xp.max(solution.angles)
     u, v = solution.parameters
     shape = errors.shape
-    angle_limit = DEFAULT_ANGLE[dtype.name] if method.normal_tolerance is None else method.normal_tolerance
-    net = unit.outward(solution.net).astype(dtype)
-    result = _ending(maximum, interpolation_tolerance(tolerance, dtype), angle, angle_limit, net, throw)
+    _, allowed = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
+    result = _ending(maximum, loss, angle, (allowed, method.normal_tolerance), net, throw)
     once = xp.zeros(1, dtype)
     entries = [average[None] + once, maximum[None] + once, once, once]
     parts = [xp.broadcast_to(u[:, None], shape), xp.broadcast_to(v[None, :], shape), errors, average, maximum]
@@ -119,17 +120,12 @@ def _check(method: NormalInterpolation, order: tuple[int, int], inner: Any, solu
         )
 
 
-def _ending(maximum: Any, tolerance: Any, angle: Any, angle_limit: float, net: Any, throw: bool) -> Any:
-    """Why the fit ended; raises the sentence if `throw` and it has not converged."""
-    if is_concrete(maximum, tolerance, angle):
-        result = RESULTS.normals_missed if angle > angle_limit else RESULTS.converged
-        result = RESULTS.stalled if maximum > float(tolerance) else result
-        if throw and result != RESULTS.converged:
-            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
-        return result
+def _ending(maximum: Any, loss: Any, angle: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
+    """Why the fit ended, with errors of which `loss` is due to rounding the net; raises the sentence if
+    `throw` and it has not converged."""
+    tolerance, angle_limit = limits
+    angle_limit = DEFAULT_ANGLE[np.dtype(net.dtype).name] if angle_limit is None else angle_limit
     code = jnp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
-    code = jnp.where(maximum > tolerance, code_of(RESULTS.stalled), code)
-    result = result_of(jnp.where(jnp.isfinite(maximum), code, code_of(RESULTS.diverged)))
-    if throw:
-        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
-    return result
+    code = jnp.where(maximum > tolerance, code_of(RESULTS.rounded), code)
+    code = jnp.where(maximum - loss > tolerance, code_of(RESULTS.stalled), code)
+    return outcome(jnp.where(jnp.isfinite(maximum), code, code_of(RESULTS.diverged)), net, throw)

@@ -57,6 +57,20 @@ class Unit(eqx.Module):
             return np.asarray(x, np.float64) * self.scale + self.centre
         return x * self.scale + _like(self.centre, x)
 
+    def loss(self, net: Any, points: Any) -> Any:
+        """How far `points`, the net (nu, nv, d) in the user's unit, have been rounded, as a fraction of the
+        diagonal: by so much errors on a surface with these control points may be larger.
+        """
+        xp: Any = np if is_concrete(net, points) else jnp
+        square = xp.sum((self.inward(points) - net) ** 2, axis=-1)
+        return (xp.sqrt(xp.max(square)) * self.scale / self.diagonal).astype(net.dtype)
+
+    def least_tolerance(self, dtype: Any) -> Any:
+        """About what rounding to `dtype` far from the origin costs, as a fraction of the diagonal."""
+        xp: Any = np if is_concrete(self.centre, self.diagonal) else jnp
+        reach = xp.max(xp.abs(self.centre)) + self.diagonal
+        return 8.0 * np.finfo(dtype).eps * reach / self.diagonal
+
 
 def _like(centre: Any, x: Any) -> Any:
     return jnp.asarray(centre, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))

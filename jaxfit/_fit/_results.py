@@ -20,6 +20,10 @@ class RESULTS(eqx.Enumeration):
         "the iteration produced numbers that are not finite or errors that grow, and was taken back to the "
         "last good surface; check the base surface and the scale of the data."
     )
+    rounded = (
+        "the tolerance was met until the control points were rounded, so far are they from the origin; "
+        "subtract the centre of the data from it, loosen the tolerance, or work in float64."
+    )
     normals_missed = (
         "some normals lie in the surface through the points or on its other side, so that it would have to "
         "fold; check their directions and signs."

@@ -3,8 +3,10 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._fit_result import Fit, History, sentence_of
@@ -34,18 +36,18 @@ def standard_fit(
     concrete = is_concrete(grid)
     dtype = working_dtype() if concrete else jnp.result_type(grid, float)
     inner = unit.inward(grid).astype(dtype)
-    tolerance = interpolation_tolerance(tolerance, np.dtype(dtype))
+    goal, tolerance = interpolation_tolerance(tolerance, np.dtype(dtype), unit.least_tolerance(dtype))
     xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
     limits = (
         xp.asarray(unit.diagonal / unit.scale, dtype),
-        xp.asarray(tolerance, dtype),
+        xp.asarray(goal, dtype),
         xp.asarray(max_steps, np.int32),
     )
     room = bucket(int(max_steps) + 1) if method.iterative else 1
     solution = solved(method, (int(order[0]), int(order[1])), room, inner, limits)
     if is_concrete(solution):
         _check(method, order, inner, solution)
-    return _fit(solution, unit, grid, limits, throw)
+    return _fit(solution, unit, grid, (xp.asarray(tolerance, dtype), limits[2]), throw)
 
 
 def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, solution: Solution) -> None:
@@ -61,7 +63,7 @@ def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, so
         )
 
 
-def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any], throw: bool) -> Fit:
+def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], throw: bool) -> Fit:
     concrete = is_concrete(solution)
     account = solution.account
     net = unit.outward(np.asarray(solution.net) if concrete else solution.net)
@@ -81,17 +83,14 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any, Any]
         "parameter_change": solution.parameter_change,
     }
     surface = BSplineSurface(net, *solution.knots)
-    return Fit(
-        surface=surface,
-        u=solution.u,
-        v=solution.v,
-        errors=solution.errors,
-        average_error=solution.average,
-        maximum_error=solution.maximum,
-        history=_history(account),
-        result=_ending(solution.maximum, account.step, limits, net, throw),
-        stats=stats,
-    )
+    fields = (solution.net, solution.errors, solution.average, solution.maximum)
+    own, *errors = (np.asarray(x) if concrete else x for x in fields)
+    loss = lax.stop_gradient(unit.loss(own, np.asarray(net) if concrete else net))
+    errors = [x + loss for x in errors]
+    result = _ending(errors[2], loss, account.step, limits, net, throw)
+    parts: Any = jax.device_put(errors) if concrete else errors
+    feet = solution.u, solution.v
+    return Fit(surface, *feet, parts[0], parts[1], parts[2], _history(account), result, stats)
 
 
 def _history(account: Account) -> History:
@@ -107,13 +106,15 @@ def _history(account: Account) -> History:
     return History(average, maximum, none, none)
 
 
-def _ending(maximum: Any, step: Any, limits: tuple[Any, Any, Any], net: Any, throw: bool) -> Any:
-    """Why the fit stopped; raises the sentence if `throw` and it has not converged."""
-    _, tolerance, most = limits
+def _ending(maximum: Any, loss: Any, step: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
+    """Why the fit stopped, with errors of which `loss` is due to rounding the net; raises the sentence if
+    `throw` and it has not converged."""
+    tolerance, most = limits
     if is_concrete(maximum, step, tolerance, most):
         if float(maximum) <= float(tolerance):
             return RESULTS.converged
         result = RESULTS.max_steps_reached if 0 < int(most) <= int(step) else RESULTS.stalled
+        result = RESULTS.rounded if float(maximum) - float(loss) <= float(tolerance) else result
         if throw:
             raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
         return result
@@ -121,6 +122,7 @@ def _ending(maximum: Any, step: Any, limits: tuple[Any, Any, Any], net: Any, thr
     code = jnp.where(
         (step >= most) & (step > 0), code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled)
     )
+    code = jnp.where(maximum - loss <= tolerance, code_of(RESULTS.rounded), code)
     code = jnp.where(finite, code, code_of(RESULTS.diverged))
     result = result_of(jnp.where(maximum <= tolerance, code_of(RESULTS.converged), code))
     if throw:
