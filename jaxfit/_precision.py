@@ -28,13 +28,15 @@ def default_foot_tolerance(dtype: np.dtype) -> float:
 def interpolation_tolerance(tolerance: Any, dtype: np.dtype, least: Any) -> tuple[Any, Any]:
     """What an interpolation is to reach, and what it may have after its net is rounded.
 
-    Both are the tolerance asked for, with advice where this precision cannot meet it. By default they are
-    the usual one, or about the `least` that the data permits where that is more.
+    Both are the tolerance asked for, with advice where this precision cannot meet it. By default the second
+    is the usual one, or the `least` that the data permits where that is more, and the first leaves room for
+    the rounding.
     """
     if tolerance is None:
         usual = DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
         greater: Any = np.maximum if is_concrete(least) else jnp.maximum
-        return greater(usual, 0.5 * least), greater(usual, least)
+        allowed = greater(usual, least)
+        return allowed - least / 8, allowed
     if is_concrete(tolerance):
         advise_x64(float(tolerance), np.dtype(dtype), stacklevel=4)
     return tolerance, tolerance
