@@ -17,13 +17,12 @@ from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._interpolation_derivative import Found, Setting, followed
 from jaxfit._fit._loop import Carry, Limits, begin, code_of, run
 from jaxfit._fit._measure import border
-from jaxfit._fit._problem import Problem, Unit, unit_of
+from jaxfit._fit._problem import Problem, Unit, axes_of_averages, unit_of
 from jaxfit._fit._repositioning import lowest_eigenvalue
 from jaxfit._fit._results import RESULTS
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface, Reflection, averaging_knots
-from jaxfit._splines._pieces import make_axis
 
 Pair = tuple[Any, Any]
 
@@ -131,7 +130,7 @@ def _iterated(
     max_steps: int,
     progress: Any,
 ) -> tuple[Carry, Problem]:
-    axes = make_axis(setting.knots[0], order[0]), make_axis(setting.knots[1], order[1])
+    axes = axes_of_averages(setting.knots, order)
     xp: Any = np if is_concrete(setting) else jnp
     target = setting.data.reshape(-1, setting.data.shape[2]).T
     ones = np.ones(target.shape[1], target.dtype)  # the net fixes the size, so points are not padded

@@ -17,8 +17,9 @@ from jaxfit._closest import as_feet, project
 from jaxfit._fit._collocation import Windows
 from jaxfit._fit._grid_systems import with_derivative
 from jaxfit._fit._measure import FOOT_STEPS, border, side_bounds
+from jaxfit._fit._problem import axes_of_averages
 from jaxfit._fit._repositioning import lowest_eigenvalue
-from jaxfit._splines._pieces import Axis, make_axis, pieces_on
+from jaxfit._splines._pieces import Axis, pieces_on
 
 NOISE = 1e3  # rounding units of the diagonal: a point so close counts as met
 SHORT = 8  # moves: as many are remembered whole rather than made twice
@@ -102,7 +103,7 @@ class _Way:
         self.net = jnp.asarray(setting.data)
         self.shape = (self.net.shape[0], self.net.shape[1])
         self.feet = (jnp.asarray(setting.feet[0]), jnp.asarray(setting.feet[1]))
-        self.axes = make_axis(setting.knots[0], order[0]), make_axis(setting.knots[1], order[1])
+        self.axes = axes_of_averages(setting.knots, order)
         self.held = border(self.shape[0], self.shape[1], corners_only=True)
         self.within = side_bounds(self.axes, *self.shape) if method.keep_borders else None
         self.limit = setting.foot_tolerance * setting.diagonal

@@ -105,6 +105,11 @@ def axes_of(surface: BSplineSurface, dtype: Any) -> tuple[Axis, Axis]:
     return axes[0], axes[1]
 
 
+def axes_of_averages(knots: tuple[Any, Any], order: tuple[int, int]) -> tuple[Axis, Axis]:
+    """Both directions of a grid's averaged knots (5), which never repeat inside."""
+    return make_axis(knots[0], order[0], simple=True), make_axis(knots[1], order[1], simple=True)
+
+
 def make_problem(
     points: Any,
     weights: Any,

@@ -113,10 +113,11 @@ class Pieces(eqx.Module):
         return self.coefficients.shape[2], self.coefficients.shape[3]
 
 
-def make_axis(knots: Float[Numbers, " knots"], order: int) -> Axis:
+def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False) -> Axis:
     """The spans of a knot vector's domain, with the smooth stretches they belong to.
 
-    Concrete knots are dealt with by NumPy, so that nothing compiles.
+    Concrete knots are dealt with by NumPy, so that nothing compiles. Of others it has to be assumed that they
+    repeat, unless interior knots are known to be `simple`.
     """
     concrete = is_concrete(knots)
     xp: Any = np if concrete else jnp
@@ -148,7 +149,7 @@ def make_axis(knots: Float[Numbers, " knots"], order: int) -> Axis:
         before=before.astype(np.int32),
         after=after.astype(np.int32),
         polynomials=span_polynomials(knots, order).astype(dtype),
-        creased=bool(np.any(crease & ~at_end)) if concrete else True,
+        creased=bool(np.any(crease & ~at_end)) if concrete else order == 2 or not simple,
     )
 
 
