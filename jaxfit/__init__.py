@@ -15,6 +15,7 @@ from jaxfit._closest import closest_point as closest_point
 from jaxfit._fit import RESULTS as RESULTS
 from jaxfit._fit import Chebyshev as Chebyshev
 from jaxfit._fit import ConstantWeight as ConstantWeight
+from jaxfit._fit import Fairing as Fairing
 from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation

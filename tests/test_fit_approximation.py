@@ -59,6 +59,75 @@ def test_a_free_boundary_moves_all_but_the_corners(base):
     assert np.abs(np.asarray(fit.surface.control_points) - expected).max() < 1e-12
 
 
+def test_relaxation_lengthens_the_move(base):
+    method = jf.GeometricApproximation(relaxation=1.7)
+    fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
+    shift, _ = one_step(POINTS, base)
+    shift[[0, -1]] = shift[:, [0, -1]] = 0
+    expected = np.asarray(base.control_points) + 1.7 * shift
+    assert np.abs(np.asarray(fit.surface.control_points) - expected).max() < 1e-12
+
+
+def test_relaxation_saves_iterations(base):
+    steps = [
+        int(jf.approximate(POINTS, base, method, tol_average=2e-4).stats["num_steps"])
+        for method in (jf.GeometricApproximation(), jf.GeometricApproximation(relaxation=1.7))
+    ]
+    assert steps[1] < 0.8 * steps[0]
+
+
+def test_fairing_is_the_mean_of_nine_neighbours(base):
+    plain = jf.approximate(POINTS, base, max_steps=1, tol_average=1e-9)
+    method = jf.GeometricApproximation(fairing=jf.Fairing(every=1, gamma=2.0))
+    faired = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
+    before, after = (np.asarray(x.surface.control_points) for x in (plain, faired))
+    weights = np.exp(-2.0 * np.add.outer(np.abs([-1, 0, 1]), np.abs([-1, 0, 1])))
+    expected = before.copy()
+    for i in range(1, before.shape[0] - 1):
+        for j in range(1, before.shape[1] - 1):
+            around = before[i - 1 : i + 2, j - 1 : j + 2]
+            expected[i, j] = np.einsum("ab,abc->c", weights, around) / weights.sum()
+    assert np.abs(after - expected).max() < 1e-12
+
+
+def test_fairing_comes_every_so_many_iterations(base):
+    method = jf.GeometricApproximation(fairing=jf.Fairing(every=5))
+    fit = jf.approximate(POINTS, base, method, tol_average=1e-9, max_steps=11)
+    average = np.asarray(fit.history.average)
+    assert (np.flatnonzero(np.diff(average) > 0) + 1).tolist() == [5, 10]
+
+
+def test_local_mode_leaves_alone_what_is_near_enough(base):
+    tolerance = 2e-3
+    near = np.asarray(jf.approximate(POINTS, base, max_steps=0).errors) <= tolerance
+    assert 0.1 < near.mean() < 0.9
+    method = jf.GeometricApproximation(local=True)
+    fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9, tol_maximum=tolerance)
+    shift, den = one_step(POINTS[~near], base)
+    shift[[0, -1]] = shift[:, [0, -1]] = 0
+    after, before = np.asarray(fit.surface.control_points), np.asarray(base.control_points)
+    assert np.abs(after - before - shift).max() < 1e-12
+    assert (after[den == 0] == before[den == 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"relaxation": 2.0}, "relaxation must lie between 0 and 2"),
+        ({"fairing": jf.Fairing(every=7)}, "stall_window must be a multiple"),
+    ],
+)
+def test_impossible_methods_get_a_sentence(options, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jf.GeometricApproximation(**options)
+
+
+@pytest.mark.parametrize("options", [{"every": 0}, {"gamma": -1.0}])
+def test_impossible_fairing_gets_a_sentence(options):
+    with pytest.raises(ValueError, match="must be"):
+        jf.Fairing(**options)
+
+
 @pytest.mark.float32_too
 def test_a_smooth_cloud_is_met_and_errors_are_distances_to_closest_points(base):
     fit = jf.approximate(POINTS, base, tol_average=6e-4)
