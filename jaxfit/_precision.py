@@ -28,18 +28,15 @@ def default_foot_tolerance(dtype: np.dtype) -> float:
 def interpolation_tolerance(tolerance: Any, dtype: np.dtype, least: Any) -> tuple[Any, Any]:
     """What an interpolation is to reach, and what it may have after its net is rounded.
 
-    Both are the tolerance asked for, with advice where this precision cannot meet it. By default the second
-    is the usual one, or the `least` that the data permits where that is more, and the first leaves room for
-    the rounding.
+    The second is the tolerance asked for, with advice where this precision cannot meet it; by default the
+    usual one, or the `least` that the data permits where that is more. The first leaves room for rounding.
     """
+    xp: Any = np if is_concrete(tolerance, least) else jnp
     if tolerance is None:
-        usual = DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
-        greater: Any = np.maximum if is_concrete(least) else jnp.maximum
-        allowed = greater(usual, least)
-        return allowed - least / 8, allowed
-    if is_concrete(tolerance):
+        tolerance = xp.maximum(DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6), least)
+    elif is_concrete(tolerance):
         advise_x64(float(tolerance), np.dtype(dtype), stacklevel=4)
-    return tolerance, tolerance
+    return xp.maximum(tolerance - least / 8, 0.5 * tolerance), tolerance
 
 
 def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 3) -> None:

@@ -31,12 +31,10 @@ def angle(surface, u, v, normals):
 
 
 @pytest.mark.float32_too
-@pytest.mark.parametrize("order", [(4, 4), (3, 5)])
-def test_points_and_normals_are_met(order):
+def test_points_and_normals_are_met():
     normals = tilted()
-    fit = jf.interpolate(GRID, normals=normals, order=order)
+    fit = jf.interpolate(GRID, normals=normals)
     assert bool(fit.converged), fit.message
-    assert fit.surface.order == order
     assert fit.surface.control_points.shape == (14, 18, 3)
     there = np.asarray(fit.surface(fit.u, fit.v))
     assert np.abs(there - GRID).max() <= 50 * eps()
@@ -108,7 +106,7 @@ def test_derivatives_are_those_of_finite_differences():
     @functools.partial(jax.value_and_grad, argnums=(0, 1))
     def value(grid, normals):
         normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
-        return jnp.sum(pull * jf.interpolate(grid, normals=normals).surface.control_points)
+        return jnp.sum(pull * jf.interpolate(grid, normals=normals, order=(3, 5)).surface.control_points)
 
     _, slopes = value(GRID, GRID)
     for which, slope in enumerate(slopes):

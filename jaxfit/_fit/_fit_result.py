@@ -40,7 +40,9 @@ class Fit(eqx.Module):
     u, v : array (points,), or (n, m) for a grid
         Parameters of the foot point of every data point.
     errors : array (points,), or (n, m) for a grid
-        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box.
+        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. Those of an
+        interpolation include what rounding the control points may add, but not the rounding of evaluating
+        the surface, which far from the origin is about as much again.
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
@@ -49,7 +51,8 @@ class Fit(eqx.Module):
         Why the fit stopped; `converged` and `message` say it as a boolean and as a sentence.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
-        foot was not found to the tolerance.
+        foot was not found to the tolerance. Of an interpolation also the `tolerance` in force; other entries
+        stand with the methods that add them.
     """
 
     surface: BSplineSurface

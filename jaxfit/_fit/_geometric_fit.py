@@ -12,6 +12,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxfit._checks import is_concrete
+from jaxfit._fit._adjoint import UnrolledAdjoint
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._interpolation_derivative import Found, Setting, followed
@@ -76,7 +77,8 @@ def geometric_fit(
         symmetry = symmetry.in_unit(unit.centre, unit.scale).located(inner)
         inner = symmetry.symmetrise_points(inner)
         grid = unit.outward(np.asarray(inner) if concrete else inner)
-        method = dataclasses.replace(method, symmetry=None)
+    # Of the method only what the loop needs, so that other choices compile nothing.
+    adjoint, method = method.adjoint, dataclasses.replace(method, symmetry=None, adjoint=UnrolledAdjoint())
     inner = (np.asarray(inner) if concrete else inner).astype(dtype)
     order = (int(order[0]), int(order[1]))
     start = started(method, order, None if symmetry is None else symmetry.axis, inner)
@@ -95,7 +97,7 @@ def geometric_fit(
     measured = carry.measured
     n, m, _ = grid.shape
     found = Found(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
-    found = followed(method, order, found, setting)
+    found = followed(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
     carry = eqx.tree_at(lambda c: c.net, carry, found.net)
     feet = found.u.reshape(-1), found.v.reshape(-1)
     carry = eqx.tree_at(lambda c: (c.measured.u, c.measured.v), carry, feet)
@@ -171,5 +173,10 @@ def _fit(
         maximum_error=parts[4],
         history=history_of(carry),
         result=outcome(code, carry.net, throw),
-        stats={"num_steps": carry.step, "diagonal": unit.diagonal, "unconverged_feet": lost},
+        stats={
+            "num_steps": carry.step,
+            "diagonal": unit.diagonal,
+            "unconverged_feet": lost,
+            "tolerance": tolerance,
+        },
     )

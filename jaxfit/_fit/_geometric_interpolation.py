@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._adjoint import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._fit._collocation import windows_at
@@ -89,6 +90,19 @@ class GeometricInterpolation(AbstractIterativeMethod):
     adjoint: AbstractAdjoint = UnrolledAdjoint()
     stall_window: int = 40
     stall_gain: float = 0.1
+
+    def __check_init__(self) -> None:
+        for name, kind, example in (
+            ("parametrisation", AbstractParametrisation, "ChordLength()"),
+            ("repositioning", AbstractRepositioning, "OptimalRepositioning()"),
+            ("acceleration", AbstractAcceleration, "Richardson()"),
+            ("foot_method", AbstractFootMethod, "Newton()"),
+            ("symmetry", (Reflection, type(None)), "Reflection()"),
+            ("adjoint", AbstractAdjoint, "UnrolledAdjoint()"),
+        ):
+            check_kind(name, getattr(self, name), kind, example)
+        if self.freeze_after is not None:
+            check_number("freeze_after", self.freeze_after, 0, whole=True)
 
     @property
     def needs_spectrum(self) -> bool:

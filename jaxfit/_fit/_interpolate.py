@@ -39,12 +39,13 @@ def interpolate(
         Degree + 1 along the first and the second index, each 2 to 8.
     tolerance : float, optional
         The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
-        1e-12 in float64, 2e-6 in float32.
+        1e-12 in float64, 2e-6 in float32, and more where the data is so far from the origin that rounding its
+        coordinates costs more: `fit.stats["tolerance"]`.
     max_steps : int
-        Most iterations (of `StandardInterpolation`, cycles of GMRES).
+        Most iterations (of `StandardInterpolation`, cycles of GMRES; `NormalInterpolation` has none).
     progress : callable, optional
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
-        not by `StandardInterpolation`, which is done in one go.
+        only by `GeometricInterpolation`; the others are done in one go.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
     normals : array (n, m, 3), optional
@@ -65,7 +66,8 @@ def interpolate(
     -----
     Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and `grad`: the
     surface and the feet have derivatives in the data, errors have none. On a closed grid (first row equal to
-    the last) the feet stay on their side of the seam.
+    the last) the feet stay on their side of the seam. With `symmetry`, fractions are of the diagonal of the
+    data as given. Outside transformations a float32 grid is fitted in float64 if the session has that.
     """
     check_order(order)
     check_number("max_steps", max_steps, 0, whole=True)

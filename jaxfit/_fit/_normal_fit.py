@@ -41,10 +41,10 @@ def normal_fit(
     dtype = working_dtype() if concrete else jnp.result_type(grid, directions, float)
     xp: Any = np if concrete else jnp
     inner = unit.inward(grid).astype(dtype)
+    directions = xp.asarray(directions, np.float64 if concrete else dtype)
     lengths = xp.linalg.norm(directions, axis=-1, keepdims=True)
-    solution = solved_with_normals(
-        method, (int(order[0]), int(order[1])), inner, (directions / lengths).astype(dtype)
-    )
+    directions = (directions / xp.where(lengths > 0, lengths, 1.0)).astype(dtype)
+    solution = solved_with_normals(method, (int(order[0]), int(order[1])), inner, directions)
     if concrete:
         solution = jax.tree.map(np.asarray, solution)
         _check(method, order, inner, solution)
@@ -65,6 +65,7 @@ def normal_fit(
         "num_steps": np.int32(0),
         "diagonal": unit.diagonal,
         "unconverged_feet": np.int32(0),
+        "tolerance": allowed,
         "normal_errors": solution.angles,
         "maximum_normal_error": angle,
     }
@@ -124,7 +125,7 @@ def _ending(maximum: Any, loss: Any, angle: Any, limits: tuple[Any, Any], net: A
     """Why the fit ended, with errors of which `loss` is due to rounding the net; raises the sentence if
     `throw` and it has not converged."""
     tolerance, angle_limit = limits
-    angle_limit = DEFAULT_ANGLE[np.dtype(net.dtype).name] if angle_limit is None else angle_limit
+    angle_limit = DEFAULT_ANGLE.get(np.dtype(net.dtype).name, 1e-3) if angle_limit is None else angle_limit
     code = jnp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
     code = jnp.where(maximum > tolerance, code_of(RESULTS.rounded), code)
     code = jnp.where(maximum - loss > tolerance, code_of(RESULTS.stalled), code)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
+from jaxfit._checks import check_kind, check_number
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import _banded as banded
 from jaxfit._splines import averaging_knots
@@ -44,6 +45,8 @@ class NormalInterpolation(eqx.Module):
     with `RESULTS.normals_missed`, on the surface as computed. `Fit.stats` holds `normal_errors` (n, m), the
     angles in radians, and `maximum_normal_error`.
 
+    Angles are those of the net before it is rounded to the user's coordinates, far from the origin.
+
     Normals far from those of the surface through the data alone are met all the same, by ripples as wide as
     the distance of two points.
 
@@ -56,6 +59,11 @@ class NormalInterpolation(eqx.Module):
 
     parametrisation: AbstractParametrisation = ChordLength()
     normal_tolerance: float | None = None
+
+    def __check_init__(self) -> None:
+        check_kind("parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength()")
+        if self.normal_tolerance is not None:
+            check_number("normal_tolerance", self.normal_tolerance, 0.0)
 
 
 class NormalSolution(eqx.Module):

@@ -86,7 +86,14 @@ def unit_of(points: Any) -> Unit:
         # Along rows of memory: across them NumPy takes ten times as long.
         columns = np.ascontiguousarray(points.T)
         low, high = columns.min(axis=1), columns.max(axis=1)
-        diagonal = float(np.linalg.norm(high - low))
+        side = float(np.max(high - low))
+        # Unit-free: squares of very small or very large numbers would leave the number range.
+        diagonal = side * float(np.linalg.norm((high - low) / side)) if side > 0 else 0.0
+        if not np.isfinite(diagonal):
+            raise ValueError(
+                "points must have differences within the range of float64, but their bounding box has none; "
+                "scale them down."
+            )
         if not diagonal > 0:
             raise ValueError(
                 "points must not all coincide, but their bounding box has no extent; give distinct points."

@@ -21,8 +21,8 @@ class RESULTS(eqx.Enumeration):
         "last good surface; check the base surface and the scale of the data."
     )
     rounded = (
-        "the tolerance was met until the control points were rounded, so far are they from the origin; "
-        "subtract the centre of the data from it, loosen the tolerance, or work in float64."
+        "the tolerance was met until the control points were rounded; loosen it, work in float64, or, if the "
+        "data is far from the origin, subtract its centre."
     )
     normals_missed = (
         "some normals lie in the surface through the points or on its other side, so that it would have to "

@@ -79,6 +79,7 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], thr
         "num_steps": account.step,
         "diagonal": unit.diagonal,
         "unconverged_feet": solution.lost,
+        "tolerance": limits[0],
         "corrections": solution.corrections,
         "parameter_change": solution.parameter_change,
     }
