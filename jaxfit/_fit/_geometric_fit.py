@@ -156,7 +156,7 @@ def _fit(
     corners = border(n, m, corners_only=True)[..., None]
     net = xp.asarray(carry.net)
     points = xp.where(corners, grid, unit.outward(net)).astype(net.dtype)
-    errors = measured.error / problem.diagonal + lax.stop_gradient(unit.loss(net, points))
+    errors = measured.error / problem.diagonal + lax.stop_gradient(unit.loss(points))
     missed = (carry.code == code_of(RESULTS.converged)) & (xp.max(errors) > tolerance)
     code = xp.where(missed, np.int32(code_of(RESULTS.rounded)), carry.code)
     lost = xp.sum(~measured.found)

@@ -49,7 +49,7 @@ def normal_fit(
         solution = jax.tree.map(np.asarray, solution)
         _check(method, order, inner, solution)
     net = unit.outward(solution.net).astype(dtype)
-    loss = lax.stop_gradient(unit.loss(solution.net, net))
+    loss = lax.stop_gradient(unit.loss(net))
     errors = solution.residual / xp.asarray(unit.diagonal / unit.scale, dtype) + loss
     average, maximum, angle = xp.mean(errors), xp.max(errors), xp.max(solution.angles)
     u, v = solution.parameters

@@ -57,13 +57,14 @@ class Unit(eqx.Module):
             return np.asarray(x, np.float64) * self.scale + self.centre
         return x * self.scale + _like(self.centre, x)
 
-    def loss(self, net: Any, points: Any) -> Any:
-        """How far `points`, the net (nu, nv, d) in the user's unit, have been rounded, as a fraction of the
-        diagonal: by so much errors on a surface with these control points may be larger.
+    def loss(self, points: Any) -> Any:
+        """At most how far rounding has moved `points`, a net (nu, nv, d) in the user's unit, as a fraction of
+        the diagonal: by so much errors on a surface with these control points may be larger.
         """
-        xp: Any = np if is_concrete(net, points) else jnp
-        square = xp.sum((self.inward(points) - net) ** 2, axis=-1)
-        return (xp.sqrt(xp.max(square)) * self.scale / self.diagonal).astype(net.dtype)
+        xp: Any = np if is_concrete(points) else jnp
+        reach = xp.maximum(xp.max(points), -xp.min(points))
+        share = 0.5 * np.finfo(points.dtype).eps * float(np.sqrt(points.shape[2]))
+        return (share * reach / self.diagonal).astype(points.dtype)
 
     def least_tolerance(self, dtype: Any) -> Any:
         """About what rounding to `dtype` far from the origin costs, as a fraction of the diagonal."""

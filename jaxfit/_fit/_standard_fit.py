@@ -84,10 +84,9 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], thr
         "parameter_change": solution.parameter_change,
     }
     surface = BSplineSurface(net, *solution.knots)
-    fields = (solution.net, solution.errors, solution.average, solution.maximum)
-    own, *errors = (np.asarray(x) if concrete else x for x in fields)
-    loss = lax.stop_gradient(unit.loss(own, np.asarray(net) if concrete else net))
-    errors = [x + loss for x in errors]
+    loss = lax.stop_gradient(unit.loss(np.asarray(net) if concrete else net))
+    fields = (solution.errors, solution.average, solution.maximum)
+    errors = [(np.asarray(x) if concrete else x) + loss for x in fields]
     result = _ending(errors[2], loss, account.step, limits, net, throw)
     parts: Any = jax.device_put(errors) if concrete else errors
     feet = solution.u, solution.v
