@@ -219,7 +219,8 @@ def test_a_fit_that_grows_gives_back_the_best_surface_it_measured():
     fit = jf.interpolate(grid, PLAIN, max_steps=300)
     assert fit.result == jf.RESULTS.stalled
     assert float(fit.maximum_error) < fit.history.maximum[-1]
-    assert abs(float(fit.maximum_error) - np.nanmin(np.asarray(fit.history.maximum))) <= 100 * eps()
+    rounding = float(fit.maximum_error) - np.nanmin(np.asarray(fit.history.maximum))  # that of the net
+    assert 0 <= rounding <= eps() * np.abs(np.asarray(fit.surface.control_points)).max() / diagonal(grid)
     at = np.asarray(fit.surface(fit.u, fit.v))
     np.testing.assert_allclose(np.linalg.norm(at - grid, axis=-1) / diagonal(grid), fit.errors, atol=1e-12)
 

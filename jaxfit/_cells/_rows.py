@@ -48,7 +48,7 @@ def row_width(points: int, cells: int) -> int:
 
 def row_count(points: int, cells: int, width: int) -> int:
     """Rows enough for any distribution of the points."""
-    return points // width + min(cells, points) if width > 1 else points
+    return points // width + min(cells, points)
 
 
 def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:

@@ -15,6 +15,7 @@ from jaxfit._checks import is_concrete
 from jaxfit._fit._adjoint import UnrolledAdjoint
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
+from jaxfit._fit._grid_outcome import extent_of, is_flat
 from jaxfit._fit._interpolation_derivative import Found, Setting, followed
 from jaxfit._fit._loop import Carry, Limits, begin, code_of, run
 from jaxfit._fit._measure import border
@@ -34,7 +35,7 @@ class Start(eqx.Module):
     feet: Pair  # (n, m) each
     averaged: Pair
     knots: Pair
-    extent: Array  # how far the grid reaches along either index: if nowhere, its parameters are made up
+    extent: Array
 
 
 @partial(jax.jit, static_argnames=("method", "order", "axis"))
@@ -52,8 +53,7 @@ def started(method: GeometricInterpolation, order: tuple[int, int], axis: int | 
         knots[axis] = Reflection(axis).symmetrise_knots(knots[axis])
     if not method.per_point:
         rows = (jnp.broadcast_to(u[:, None], (n, m)), jnp.broadcast_to(v[None, :], (n, m)))
-    extent = jnp.stack([jnp.max(jnp.abs(jnp.diff(data, axis=index))) for index in (0, 1)])
-    return Start(rows, (u, v), (knots[0], knots[1]), extent)
+    return Start(rows, (u, v), (knots[0], knots[1]), extent_of(data))
 
 
 def geometric_fit(
@@ -106,14 +106,14 @@ def geometric_fit(
 
 def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: Reflection | None) -> None:
     """Raise where a grid has no parameters, so that the traced part made some up."""
-    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
+    flat = is_flat(start.extent, inner)
     increasing = all((np.diff(x) > 0).all() for x in start.averaged)
-    if symmetry is not None and (start.extent <= noise).any():
+    if symmetry is not None and flat:
         raise ValueError(
             f"symmetry leaves the grid no extent along one index, since it pairs points along axis="
             f"{symmetry.axis} that are no mirror images; pair the other index, or give the normal."
         )
-    if not increasing or (start.extent <= noise).any():
+    if not increasing or flat:
         grid_parameters(inner, method.parametrisation)
 
 

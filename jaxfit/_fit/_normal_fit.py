@@ -8,12 +8,12 @@ import numpy as np
 from jax import lax
 
 from jaxfit._checks import as_floating, is_concrete
-from jaxfit._fit._fit_result import Fit, History, outcome
+from jaxfit._fit._fit_result import Fit, History
+from jaxfit._fit._grid_outcome import check_solved, ending
 from jaxfit._fit._loop import code_of
-from jaxfit._fit._normal_interpolation import NormalInterpolation, NormalSolution, solved_with_normals
+from jaxfit._fit._normal_interpolation import NormalInterpolation, solved_with_normals
 from jaxfit._fit._problem import unit_of
 from jaxfit._fit._results import RESULTS
-from jaxfit._parameters import grid_parameters
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -47,7 +47,7 @@ def normal_fit(
     solution = solved_with_normals(method, (int(order[0]), int(order[1])), inner, directions)
     if concrete:
         solution = jax.tree.map(np.asarray, solution)
-        _check(method, order, inner, solution)
+        check_solved(method.parametrisation, order, inner, solution.extent, solution.net)
     net = unit.outward(solution.net).astype(dtype)
     loss = lax.stop_gradient(unit.loss(net))
     errors = solution.residual / xp.asarray(unit.diagonal / unit.scale, dtype) + loss
@@ -109,24 +109,10 @@ def _checked_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
     return directions
 
 
-def _check(method: NormalInterpolation, order: tuple[int, int], inner: Any, solution: NormalSolution) -> None:
-    """Raise where a grid has no parameters, so that the traced part made some up, or no solution."""
-    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
-    if (solution.extent <= noise).any():
-        grid_parameters(inner, method.parametrisation)
-    if not np.isfinite(solution.net).all():
-        raise ValueError(
-            f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
-            "matrix is singular to rounding; lower the order, or remove points that repeat."
-        )
-
-
 def _ending(maximum: Any, loss: Any, angle: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
-    """Why the fit ended, with errors of which `loss` is due to rounding the net; raises the sentence if
-    `throw` and it has not converged."""
+    """Why the fit ended; raises the sentence if `throw` and it has not converged."""
     tolerance, angle_limit = limits
     angle_limit = DEFAULT_ANGLE.get(np.dtype(net.dtype).name, 1e-3) if angle_limit is None else angle_limit
-    code = jnp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
-    code = jnp.where(maximum > tolerance, code_of(RESULTS.rounded), code)
-    code = jnp.where(maximum - loss > tolerance, code_of(RESULTS.stalled), code)
-    return outcome(jnp.where(jnp.isfinite(maximum), code, code_of(RESULTS.diverged)), net, throw)
+    xp: Any = np if is_concrete(angle) else jnp
+    met = xp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
+    return ending(maximum, loss, tolerance, met, code_of(RESULTS.stalled), net, throw)

@@ -9,6 +9,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._checks import check_kind, check_number
+from jaxfit._fit._grid_outcome import extent_of
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import _banded as banded
 from jaxfit._splines import averaging_knots
@@ -99,9 +100,8 @@ def solved_with_normals(
     on_rows, across_rows = parted(met, 1)
     (values, derivative_u), (derivative_v, _) = parted(on_rows, 0), parted(across_rows, 0)
     residual = jnp.sqrt(jnp.sum((lax.stop_gradient(data) - values) ** 2, axis=-1))
-    extent = jnp.stack([jnp.max(jnp.abs(jnp.diff(lax.stop_gradient(data), axis=axis))) for axis in (0, 1)])
     angles = angles_between(jnp.cross(derivative_u, derivative_v), lax.stop_gradient(normals))
-    return NormalSolution(net, (knots[0], knots[1]), (u, v), residual, angles, extent)
+    return NormalSolution(net, (knots[0], knots[1]), (u, v), residual, angles, extent_of(data))
 
 
 def slopes(u: Array, order: int, values: Float[Array, "n m d"], axis: int) -> Float[Array, "n m d"]:

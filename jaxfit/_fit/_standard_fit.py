@@ -2,20 +2,19 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._fit_result import Fit, History, sentence_of
+from jaxfit._fit._fit_result import Fit, History
+from jaxfit._fit._grid_outcome import check_solved, ending
 from jaxfit._fit._grid_systems import Account
-from jaxfit._fit._loop import code_of, result_of
+from jaxfit._fit._loop import code_of
 from jaxfit._fit._problem import Unit, unit_of
 from jaxfit._fit._results import RESULTS
 from jaxfit._fit._standard_interpolation import Solution, StandardInterpolation, solved
-from jaxfit._parameters import grid_parameters
 from jaxfit._precision import bucket, interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -46,21 +45,8 @@ def standard_fit(
     room = bucket(int(max_steps) + 1) if method.iterative else 1
     solution = solved(method, (int(order[0]), int(order[1])), room, inner, limits)
     if is_concrete(solution):
-        _check(method, order, inner, solution)
+        check_solved(method.parametrisation, order, inner, solution.extent, solution.maximum)
     return _fit(solution, unit, grid, (xp.asarray(tolerance, dtype), limits[2]), throw)
-
-
-def _check(method: StandardInterpolation, order: tuple[int, int], inner: Any, solution: Solution) -> None:
-    """Raise where a grid has no parameters, so that the traced part made some up, or no solution."""
-    noise = 4 * float(np.finfo(inner.dtype).eps) * max(inner.shape)
-    if (np.asarray(solution.extent) <= noise).any():
-        # The exact test is the parametrisation's own; no row is shorter than its longest step.
-        grid_parameters(inner, method.parametrisation)
-    if not np.isfinite(solution.maximum):
-        raise ValueError(
-            f"grid is too unevenly spaced for order {tuple(order)} in {inner.dtype}, since its collocation "
-            "matrix is singular to rounding; lower the order, or remove points that repeat."
-        )
 
 
 def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], throw: bool) -> Fit:
@@ -107,24 +93,9 @@ def _history(account: Account) -> History:
 
 
 def _ending(maximum: Any, loss: Any, step: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
-    """Why the fit stopped, with errors of which `loss` is due to rounding the net; raises the sentence if
-    `throw` and it has not converged."""
+    """Why the fit stopped; raises the sentence if `throw` and it has not converged."""
     tolerance, most = limits
-    if is_concrete(maximum, step, tolerance, most):
-        if float(maximum) <= float(tolerance):
-            return RESULTS.converged
-        result = RESULTS.max_steps_reached if 0 < int(most) <= int(step) else RESULTS.stalled
-        result = RESULTS.rounded if float(maximum) - float(loss) <= float(tolerance) else result
-        if throw:
-            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
-        return result
-    finite = jnp.isfinite(maximum)
-    code = jnp.where(
-        (step >= most) & (step > 0), code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled)
-    )
-    code = jnp.where(maximum - loss <= tolerance, code_of(RESULTS.rounded), code)
-    code = jnp.where(finite, code, code_of(RESULTS.diverged))
-    result = result_of(jnp.where(maximum <= tolerance, code_of(RESULTS.converged), code))
-    if throw:
-        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
-    return result
+    xp: Any = np if is_concrete(step, most) else jnp
+    spent = (step >= most) & (step > 0)
+    missed = xp.where(spent, code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled))
+    return ending(maximum, loss, tolerance, code_of(RESULTS.converged), missed, net, throw)

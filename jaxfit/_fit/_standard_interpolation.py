@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._fit._grid_outcome import extent_of
 from jaxfit._fit._grid_systems import (
     Account,
     distances,
@@ -137,8 +138,6 @@ def solved(
 
 def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: Corrected) -> Solution:
     account = found.account
-    # How far the grid reaches along either index: if nowhere, its parameters are made up.
-    extent = jnp.stack([jnp.max(jnp.abs(jnp.diff(task.data, axis=axis))) for axis in (0, 1)])
     return Solution(
         net=net,
         knots=task.knots,
@@ -148,7 +147,7 @@ def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: 
         account=account,
         average=account.average[account.step],
         maximum=account.maximum[account.step],
-        extent=lax.stop_gradient(extent),
+        extent=extent_of(task.data),
         corrections=found.number,
         parameter_change=jnp.where(found.number > 0, found.change, 0.0),
         lost=found.lost,
