@@ -21,6 +21,7 @@ from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
 from jaxfit._fit import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._fit import KnotInsertion as KnotInsertion
 from jaxfit._fit import NormalInterpolation as NormalInterpolation
 from jaxfit._fit import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit import Richardson as Richardson

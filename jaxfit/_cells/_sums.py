@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._cells._rows import Rows
@@ -31,18 +31,25 @@ def net_sums(
 
     `poly_u`, `poly_v` are the basis functions as polynomials (`span_polynomials`).
     """
-    moments = _row_moments(s, t, values, poly_u.shape[1], poly_v.shape[1])
+    moments = row_moments(s, t, values, poly_u.shape[1], poly_v.shape[1])
     spans_u, spans_v = poly_u.shape[0], poly_v.shape[0]
     cells = jax.ops.segment_sum(moments, rows.cell, spans_u * spans_v, indices_are_sorted=True)
-    return _cells_to_net(cells, poly_u, poly_v)
+    return cells_to_net(cells, poly_u, poly_v)
 
 
-def _row_moments(s: Array, t: Array, values: Array, order_u: int, order_v: int) -> Float[Array, "rows K L c"]:
-    # One broadcast product, summed along the row: a batched matrix product of these sizes is several times
-    # slower on a CPU, and a sum for each pair of powers takes long to compile.
+def row_moments(
+    s: Float[Array, "rows width"],
+    t: Float[Array, "rows width"],
+    values: Float[Array, "c rows width"],
+    order_u: int,
+    order_v: int,
+) -> Float[Array, "rows K L*c"]:
+    """Sums over each row of s^a t^b x, the last index running over b and within it over the values x."""
     powers_s, powers_t = _powers(s, order_u), _powers(t, order_v)
-    product = powers_s[:, None, None] * powers_t[None, :, None] * values[None, None]
-    return jnp.moveaxis(jnp.sum(product, axis=-1), -1, 0)
+    product = (powers_t[:, None] * values[None]).reshape(-1, *s.shape)
+    # One small matrix product a row, each row's sums side by side as the sum over rows reads them.
+    across, rows = ((2,), (2,)), ((1,), (1,))
+    return lax.dot_general(powers_s, product, (across, rows), precision=lax.Precision.HIGHEST)
 
 
 def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order rows width"]:
@@ -52,8 +59,8 @@ def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order ro
     return jnp.stack(powers)
 
 
-def _cells_to_net(
-    moments: Float[Array, "cells K L c"],
+def cells_to_net(
+    moments: Float[Array, "cells K L*c"],
     poly_u: Float[Numbers, "spans_u K K"],
     poly_v: Float[Numbers, "spans_v L L"],
 ) -> Float[Array, "nu nv c"]:

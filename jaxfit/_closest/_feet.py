@@ -216,7 +216,7 @@ def _next_trial(
     A foot that has settled, or is held at its bounds, gets its own parameters back.
     """
     always = limits.tolerance < jnp.inf
-    pinned_s, pinned_t, settled = _pins(first, u, v, box, limits.tolerance)
+    pinned_s, pinned_t, settled = pins(first, u, v, box, limits.tolerance)
     ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
     if not method.quadratic:
         newton_s, newton_t = staged(always, Newton().step, first, pinned_s, pinned_t)
@@ -228,8 +228,8 @@ def _next_trial(
 def _foresee(
     first: Forms, u: Array, v: Array, ds: Array, dt: Array, best: Array, box: Box, limits: Limits
 ) -> tuple[Array, Array, Array, Array]:
-    next_u = _landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
-    next_v = _landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+    next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
+    next_v = landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
     # |step|^2 in the metric of the Hessian is half the fall of f to come, and was half its last fall.
     fall = first.gradient_s * ds + first.gradient_t * dt
     before = jnp.where(best < jnp.inf, best - first.f, 0.0)
@@ -248,7 +248,7 @@ def _foresee(
     return next_u, next_v, jnp.maximum(first.f - fall, 0.0), foreseen
 
 
-def _landing(u: Array, ds: Array, low: Array, high: Array, half: Array, rate: Array) -> Array:
+def landing(u: Array, ds: Array, low: Array, high: Array, half: Array, rate: Array) -> Array:
     """Where a step ends; one cut off at a bound ends on the bound to the last bit."""
     free = jnp.clip(u + ds * half, low, high)
     return jnp.where(ds <= (low - u) * rate, low, jnp.where(ds >= (high - u) * rate, high, free))
@@ -270,24 +270,24 @@ def _downhill(
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.
     """
     ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)
-    ds, dt = _within(box, u, v, ds, dt)
+    ds, dt = within(box, u, v, ds, dt)
     uphill = first.gradient_s * ds + first.gradient_t * dt <= 0
     tiny = jnp.finfo(u.dtype).tiny
     slope_s = jnp.where(pinned_s, 0.0, 0.5 * first.gradient_s / jnp.maximum(first.E, tiny))
     slope_t = jnp.where(pinned_t, 0.0, 0.5 * first.gradient_t / jnp.maximum(first.G, tiny))
-    slope_s, slope_t = _within(box, u, v, slope_s, slope_t)
+    slope_s, slope_t = within(box, u, v, slope_s, slope_t)
     ds, dt = jnp.where(uphill, slope_s, ds), jnp.where(uphill, slope_t, dt)
     return jnp.where(settled, 0.0, ds), jnp.where(settled, 0.0, dt)
 
 
-def _within(box: Box, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
+def within(box: Box, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
     """A step in local coordinates, cut off at the bounds."""
     low_s, high_s = (box.low_u - u) * box.rate_u, (box.high_u - u) * box.rate_u
     low_t, high_t = (box.low_v - v) * box.rate_v, (box.high_v - v) * box.rate_v
     return jnp.clip(ds, low_s, high_s), jnp.clip(dt, low_t, high_t)
 
 
-def _pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array, Array]:
+def pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array, Array]:
     """Which coordinates are held at a bound by the gradient, and whether the free ones are settled.
 
     Settled: the residual's components along the free tangents, lengths, are below the tolerance.

@@ -85,7 +85,7 @@ def _pass(
         start, feet = carry
         part = rows.block(start, size)
         coefficients = jnp.moveaxis(pieces.coefficients[part.cell], 0, -1)[..., None]
-        box = _box(pieces, part.cell, [x if x.ndim == 0 else part.spread(x[None])[0] for x in border])
+        box = box_of(pieces, part.cell, [x if x.ndim == 0 else part.spread(x[None])[0] for x in border])
         goal = part.spread(target)
         mine = Feet(part.spread(feet.real), part.spread(feet.whole))
         mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
@@ -104,7 +104,7 @@ def _pass(
     return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), feet))[1]
 
 
-def _box(pieces: Pieces, cell: Array, border: Sequence[Array]) -> Box:
+def box_of(pieces: Pieces, cell: Array, border: Sequence[Array]) -> Box:
     """Bounds and local coordinates of cells given by number, with a last axis to broadcast along."""
     low_u, high_u, centre_u, half_u = _bounds(pieces.axis_u, cell // pieces.axis_v.cells)
     low_v, high_v, centre_v, half_v = _bounds(pieces.axis_v, cell % pieces.axis_v.cells)

@@ -11,6 +11,7 @@ from jaxfit._fit._frozen import Chebyshev as Chebyshev
 from jaxfit._fit._frozen import Richardson as Richardson
 from jaxfit._fit._geometric_approximation import GeometricApproximation as GeometricApproximation
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
+from jaxfit._fit._growth import KnotInsertion as KnotInsertion
 from jaxfit._fit._interpolate import interpolate as interpolate
 from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation
 from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight

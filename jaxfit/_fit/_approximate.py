@@ -22,8 +22,9 @@ from jaxfit._closest import closest_point
 from jaxfit._fit._fit_result import Fit, history_of, outcome
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
+from jaxfit._fit._growth import cut, with_room
 from jaxfit._fit._loop import Carry, Limits, begin, run
-from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, padded_start, unit_of
+from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -99,37 +100,54 @@ def approximate(
     unit = unit_of(cloud)
     concrete = is_concrete(cloud, base, pulls, start)
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
-    problem = make_problem(cloud, pulls, axes_of(base, dtype), unit, method.foot_tolerance)
+    axes = axes_of(base, dtype)
+    problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
     size = problem.target.shape[1]
-    net = jnp.asarray(unit.inward(base.control_points), dtype)
+    begun = net = jnp.asarray(unit.inward(base.control_points), dtype)
+    growth = None
+    if method.insertion is not None:
+        knots = base.knots_u.astype(dtype), base.knots_v.astype(dtype)
+        net, growth = with_room(net, knots, axes, method.insertion.room(max_steps))
     if start is not None:
         u, v = _checked_start(start, cloud.shape[0])
     elif concrete:
-        u, v, _, _ = global_feet(method, problem, net, cloud.shape[0], max_steps)
+        u, v, _, _ = global_feet(method, problem, net, growth, cloud.shape[0], max_steps)
     else:
         feet = closest_point(base, cloud)
         u, v = feet.u, feet.v
     u, v = (padded_start(x, size, dtype) for x in (u, v))
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
-    carry = begin(net, u, v, max_steps)
-    carry = run(method, problem, limits, carry, progress if concrete else None)
-    surface = _surface(carry, base, net, unit)
-    parts = _parts(carry, method, problem, cloud.shape[0], max_steps, concrete)
-    return _finished(carry, parts, unit, surface, concrete, throw)
+    together = order_by_cell(axes, u, v, cloud.shape[0])
+    carry = begin(net, u[together], v[together], max_steps, growth=growth, pulls=True)
+    carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
+    surface = _surface(carry, base, begun, unit)
+    parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
+    return _finished(carry, method, parts, unit, surface, concrete, throw)
 
 
 def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
-    """The fitted surface in the user's unit; control points that have not moved keep every bit."""
-    moved = jnp.asarray(unit.outward(carry.net), base.control_points.dtype)
-    net = jnp.where(carry.net == begun, base.control_points, moved)
-    return BSplineSurface(net, base.knots_u, base.knots_v)
+    """The fitted surface in the user's unit; control points that have not moved keep every bit.
+
+    Inside transformations a net with room for more keeps its surplus control points.
+    """
+    parts: Any = (carry.net, base.knots_u, base.knots_v)
+    if carry.growth is not None:
+        growth, whole = carry.growth, not is_concrete(carry)
+        parts = (carry.net, growth.knots_u, growth.knots_v) if whole else cut(carry.net, growth)
+    net, *knots = parts
+    dtype = base.control_points.dtype
+    moved = jnp.asarray(unit.outward(net), dtype)
+    if net.shape == begun.shape:
+        moved = jnp.where(net == begun, base.control_points, moved)
+    return BSplineSurface(moved, *(jnp.asarray(x, dtype) for x in knots))
 
 
 def _parts(
     carry: Carry,
     method: GeometricApproximation,
     problem: Problem,
+    order: Any,
     count: int,
     max_steps: int,
     concrete: bool,
@@ -139,12 +157,13 @@ def _parts(
     Feet were followed locally; where another part of the surface has come nearer, that counts.
     """
     measured = carry.measured
-    errors = measured.error / problem.diagonal
+    parts = (measured.u, measured.v, measured.error / problem.diagonal, measured.found)
     if not concrete:
-        return measured.u, measured.v, errors, measured.found
-    parts = (measured.u, measured.v, errors, measured.found)
-    u, v, distances, found = (np.array(x)[:count] for x in parts)
-    best = global_feet(method, problem, carry.net, count, max_steps)
+        back = jnp.argsort(order)
+        return tuple(x[back] for x in parts)
+    place = np.argsort(order)[:count]
+    u, v, distances, found = (np.asarray(x)[place] for x in parts)
+    best = global_feet(method, problem, carry.net, carry.growth, count, max_steps)
     distance = best[2] / float(problem.diagonal)
     nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
@@ -153,7 +172,13 @@ def _parts(
 
 
 def _finished(
-    carry: Carry, parts: Any, unit: Unit, surface: BSplineSurface, concrete: bool, throw: bool
+    carry: Carry,
+    method: GeometricApproximation,
+    parts: Any,
+    unit: Unit,
+    surface: BSplineSurface,
+    concrete: bool,
+    throw: bool,
 ) -> Fit:
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, errors = (jax.device_put(x) if concrete else x for x in parts[:3])
@@ -164,7 +189,7 @@ def _finished(
         errors=errors,
         average_error=jnp.asarray(xp.mean(parts[2])),
         maximum_error=jnp.asarray(xp.max(parts[2])),
-        history=history_of(carry),
+        history=history_of(carry, method),
         result=outcome(carry.code, carry.net, throw),
         stats={
             "num_steps": carry.step,

@@ -3,8 +3,9 @@
 import math
 
 import equinox as eqx
+import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 
 class Fairing(eqx.Module):
@@ -31,11 +32,11 @@ class Fairing(eqx.Module):
         if not 0 <= self.gamma < math.inf:
             raise ValueError(f"gamma must be finite and at least 0, but is {self.gamma!r}; 2 is usual.")
 
-    def __call__(self, net: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
-        """The faired net; its border stays."""
+    def __call__(self, net: Float[Array, "nu nv d"], held: Bool[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
+        """The faired net; its border, and what is `held`, stays."""
         near = math.exp(-self.gamma)
         total = 1.0 + 4.0 * near + 4.0 * near**2
         # The mean is a product of one along each direction.
         rows = net[1:-1] + near * (net[:-2] + net[2:])
         inner = (rows[:, 1:-1] + near * (rows[:, :-2] + rows[:, 2:])) / total
-        return net.at[1:-1, 1:-1].set(inner)
+        return jnp.where(held[..., None], net, net.at[1:-1, 1:-1].set(inner))

@@ -4,9 +4,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._loop import Carry, result_of
@@ -21,6 +22,10 @@ class History(eqx.Module):
     while a method holds them. `evaluations` of the surface were made for a foot, and its parameters (u plus
     v) moved by `change`, both on average over the points.
 
+    Of approximations, `active` points pulled in each iteration, and `net` is the number of control points
+    along u and v; `faired` and `refined` mark the surfaces that fairing or new knots have just changed. Fits
+    of grids have none of these.
+
     Inside a transformation, where the number of iterations is not known, the arrays have room for more
     and end in NaN.
     """
@@ -29,6 +34,10 @@ class History(eqx.Module):
     maximum: Float[Array, " steps"]
     evaluations: Float[Array, " steps"]
     change: Float[Array, " steps"]
+    active: Int[Array, " steps"] | None = None
+    net: Int[Array, "steps 2"] | None = None
+    faired: Bool[Array, " steps"] | None = None
+    refined: Bool[Array, " steps"] | None = None
 
 
 class Fit(eqx.Module):
@@ -82,14 +91,30 @@ def sentence_of(result: Any) -> str:
     return sentences[result]
 
 
-def history_of(carry: Carry) -> History:
-    """The recorded errors, cut to the iterations made where that number is known."""
-    if is_concrete(carry):
-        end = int(carry.step) + 1
+def history_of(carry: Carry, method: Any = None) -> History:
+    """The recorded errors, cut to the iterations made where that number is known; `method` is that of an
+    approximation.
+    """
+    records, concrete = carry.next.records, is_concrete(carry)
+    columns: list[Any] = [records.average, records.maximum, records.evaluations, records.change]
+    if records.active is not None and records.shape is not None:
+        columns += [records.active, records.shape.T]
+    if concrete:
         # Cut by NumPy: by JAX, every new length would be a new compilation.
-        columns = [np.asarray(x)[:end] for x in jax.tree.leaves(carry.next.records)]
-        return History(*jax.device_put(columns))
-    return History(*jax.tree.leaves(carry.next.records))
+        columns = [np.asarray(x)[: int(carry.step) + 1] for x in columns]
+    if records.shape is not None:
+        columns += _marks(columns[-1], method.fairing)
+    return History(*(jax.device_put(columns) if concrete else columns))
+
+
+def _marks(net: Any, fairing: Any) -> list[Any]:
+    """Which surfaces have just been faired, and which just been refined."""
+    xp: Any = np if is_concrete(net) else jnp
+    step = np.arange(net.shape[0])
+    none = step < 0
+    faired = none if fairing is None else (step > 0) & (step % fairing.every == 0)
+    before = xp.concatenate([net[:1], net[:-1]])
+    return [xp.asarray(faired), xp.any(net > before, axis=1)]
 
 
 def outcome(code: Any, net: Any, throw: bool) -> Any:

@@ -122,4 +122,4 @@ def iterate_frozen(method: Any, limits: Limits, system: System, most: Array, tur
     _, net, step, records, _ = lax.while_loop(lambda x: x[0] & (x[2] < last), body, begin)
     # The first entry is that of the exact errors, which the loop has written over.
     exact = jax.tree.map(lambda x, y: x.at[turn.step].set(y[turn.step]), records, turn.records)
-    return Turn(jnp.moveaxis(net, 0, -1), step, exact)
+    return Turn(jnp.moveaxis(net, 0, -1), step, exact, turn.growth)

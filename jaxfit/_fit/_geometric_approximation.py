@@ -1,23 +1,18 @@
 """Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
 
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 
-from jaxfit._cells import (
-    evaluate_values,
-    local_coordinates,
-    net_sums,
-    row_coefficients,
-    row_width,
-    rows_of,
-    staged,
-)
-from jaxfit._closest import AbstractFootMethod, Newton
+from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
+from jaxfit._fit._growth import KnotInsertion, refined
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border, measure_feet
+from jaxfit._fit._measure import border_on, measure_feet
+from jaxfit._fit._pull import pull
 from jaxfit._splines._pieces import Pieces
 
 
@@ -37,9 +32,16 @@ class GeometricApproximation(AbstractIterativeMethod):
     fixed_boundary : bool
         Hold the border control points (section 2.3 of the paper); otherwise only the four corners.
     relaxation : float
-        How far control points follow, as a multiple of the mean (default 1, the paper's). Safe below 2, since
-        the largest eigenvalue of the iteration with feet held is 1; 1.7 takes about two thirds of the
-        iterations.
+        How far control points follow, as a multiple of the mean: 1.7 by default, 1 in the paper. Safe below
+        2, since the largest eigenvalue of the iteration with feet held is 1; 1.7 takes about two thirds of
+        the iterations of 1.
+    foresee : bool
+        Whether feet take one step in each iteration, the residual there being foreseen to first order, rather
+        than converge (default True; False in the paper). The first and the last surface are measured at
+        converged feet all the same.
+    insertion : KnotInsertion(), optional
+        New knots every few iterations where the errors are greatest; none by default, so that the net stays
+        as it is given.
     fairing : Fairing(), optional
         Laplacian fairing of the net every few iterations (section 4.3); none by default.
     local : bool, default False
@@ -56,13 +58,29 @@ class GeometricApproximation(AbstractIterativeMethod):
     """
 
     fixed_boundary: bool = True
-    relaxation: float = 1.0
+    relaxation: float = 1.7
+    foresee: bool = True
+    insertion: KnotInsertion | None = None
     fairing: Fairing | None = None
     local: bool = False
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 40
     stall_gain: float = 2e-3
+
+    @classmethod
+    def paper(cls, **changes: Any) -> "GeometricApproximation":
+        """Section 4 as printed: no relaxation, converged feet, fairing, and new knots.
+
+        `changes` are fields to set otherwise.
+        """
+        fields = dict(relaxation=1.0, foresee=False, insertion=KnotInsertion(), fairing=Fairing())
+        return cls(**(fields | dict(foot_method=HuWallner(), foot_tolerance=1e-8) | changes))
+
+    @property
+    def foresees(self) -> bool:
+        """Whether feet between the first surface and the last need not have converged."""
+        return self.foresee
 
     def __check_init__(self) -> None:
         if not 0 < self.relaxation < 2:
@@ -77,37 +95,49 @@ class GeometricApproximation(AbstractIterativeMethod):
             )
 
     def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
-        """One step of Algorithm 1 from converged feet."""
-        net = turn.net
-        weight = problem.weight
-        if self.local:
-            threshold = jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
-            weight = jnp.where(measured.error > threshold * problem.diagonal, weight, 0.0)
-        width = row_width(measured.u.shape[0], pieces.cells)
-        rows = rows_of(pieces, measured.u, measured.v, width, weight <= 0)
-
-        def errors_in_rows() -> tuple[Array, Array, Array]:
-            u, v, pull = rows.spread(jnp.stack([measured.u, measured.v, weight]))
-            s, t = local_coordinates(pieces, rows.cell[:, None], u, v)
-            on_surface = evaluate_values(row_coefficients(pieces, rows), s, t)
-            pull = jnp.where(rows.filled, pull, 0.0)
-            error = rows.spread(problem.target) - on_surface
-            return s, t, jnp.concatenate([pull[None] * error, pull[None]])
-
-        s, t, values = staged(problem.diagonal > 0, errors_in_rows)
-        sums = net_sums(rows, s, t, values, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
-        total = sums[..., -1:]
-        touched = total > 0
-        shift = jnp.where(touched, sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
-        held = border(net.shape[0], net.shape[1], corners_only=not self.fixed_boundary)
-        moved = jnp.where(held[..., None], net, net + self.relaxation * shift)
+        """One step of Algorithm 1, fairing, and new knots."""
+        assert measured.pulls is not None
+        net, growth = turn.net, turn.growth
+        axes = (pieces.axis_u, pieces.axis_v)
+        held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
+        moved = jnp.where(held[..., None], net, net + self.relaxation * measured.pulls.means)
         step = turn.step + 1
         if self.fairing is not None:
-            moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved), moved)
-        return Turn(moved, step, turn.records)
+            outside = border_on(axes, net.shape, corners_only=False)
+            moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved, outside), moved)
+        if self.insertion is not None and growth is not None:
+            error = jnp.where(problem.padding > 0, measured.error, 0.0)
+            moved, growth = lax.cond(
+                step % self.insertion.every == 0,
+                lambda: refined(moved, growth, measured.u, measured.v, error),
+                lambda: (moved, growth),
+            )
+        return Turn(moved, step, turn.records, growth)
 
-    def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
-        """Feet from the last ones, converged on the new surface."""
-        # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
+    def measure(
+        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
+    ) -> Measured:
+        """Feet from the last ones, converged on the new surface or one step on, and how they pull."""
         idle = problem.padding <= 0
-        return measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
+
+        def converged(measured: Measured) -> Measured:
+            # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
+            return measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
+
+        bare = eqx.tree_at(lambda m: m.pulls, measured, None)
+        here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
+        follower = self.foot_method if self.foresees else None
+        weigh = partial(self._weigh, problem, limits)
+        feet, pulls = pull(problem, pieces, here.u, here.v, idle, weigh, follower)
+        if self.foresees:
+            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
+            steps = jnp.where(exact, here.steps, 1)
+            here = Measured(u, v, error, steps, here.found)
+        return Measured(here.u, here.v, here.error, here.steps, here.found, pulls)
+
+    def _weigh(self, problem: Any, limits: Limits, weight: Array, error: Array) -> Array:
+        """How much points with these errors pull."""
+        if not self.local:
+            return weight
+        threshold = jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
+        return jnp.where(error > threshold * problem.diagonal, weight, 0.0)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax.numpy as jnp
+from jax import Array
 
 from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -125,7 +126,9 @@ class GeometricInterpolation(AbstractIterativeMethod):
             most = jnp.where(turn.step < self.freeze_after, 1, limits.max_steps)
         return iterate_frozen(self, limits, system, most, turn)
 
-    def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
+    def measure(
+        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
+    ) -> Measured:
         """Closest points from the last ones."""
         nu, nv = (x.cells + k - 1 for x, k in zip((pieces.axis_u, pieces.axis_v), pieces.order, strict=True))
         corners = border(nu, nv, corners_only=True).reshape(-1)

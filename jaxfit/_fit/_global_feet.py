@@ -12,17 +12,29 @@ import numpy as np
 from jax import Array
 
 from jaxfit._closest import globally, padded, prepare
+from jaxfit._fit._growth import Growth, cut
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, advance, begin
 from jaxfit._fit._problem import Problem
+from jaxfit._splines._pieces import make_axis
 
 Feet = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def global_feet(
-    method: AbstractIterativeMethod, problem: Problem, net: Array, count: int, max_steps: int
+    method: AbstractIterativeMethod,
+    problem: Problem,
+    net: Array,
+    growth: Growth | None,
+    count: int,
+    max_steps: int,
 ) -> Feet:
     """(u, v, distance, found) of the first `count` points, in the problem's unit."""
-    prepared = prepare(net, problem.axis_u, problem.axis_v, sampled=True)
+    if growth is None:
+        prepared = prepare(net, problem.axis_u, problem.axis_v, sampled=True)
+    else:  # nothing is to be sampled behind the last control point in use
+        used, knots_u, knots_v = cut(net, growth)
+        orders = (len(knots_u) - used.shape[0], len(knots_v) - used.shape[1])
+        prepared = prepare(used, make_axis(knots_u, orders[0]), make_axis(knots_v, orders[1]), sampled=True)
     size = problem.target.shape[1]
     points = np.asarray(problem.target)[:, :count]
     dtype = problem.target.dtype
@@ -35,7 +47,7 @@ def global_feet(
         inputs = (jnp.asarray(padded(np.asarray(x), size).astype(dtype)) for x in (chosen, u, v))
         target, start_u, start_v = inputs
         mine = eqx.tree_at(lambda p: (p.target, p.weight, p.padding), problem, (target, real, real))
-        first = begin(net, start_u, start_v, max_steps)
+        first = begin(net, start_u, start_v, max_steps, growth=growth, pulls=True)
         carry = advance(method, mine, limits, nothing, first)
         m = carry.measured
         fields = dict(u=m.u, v=m.v, error=m.error, converged=m.found, steps=m.steps)

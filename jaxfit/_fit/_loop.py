@@ -17,9 +17,11 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
+from jaxfit._fit._growth import Growth
+from jaxfit._fit._pull import Pulls
 from jaxfit._fit._results import RESULTS
 from jaxfit._precision import bucket
-from jaxfit._splines._pieces import Pieces, pieces_on
+from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
@@ -35,6 +37,7 @@ class Measured(eqx.Module):
     error: Float[Any, " points"]
     steps: Int[Any, " points"]
     found: Bool[Any, " points"]
+    pulls: Pulls | None = None  # of methods that gather them while they measure
 
 
 class Limits(eqx.Module):
@@ -52,11 +55,26 @@ class Records(eqx.Module):
     maximum: Float[Any, " steps"]
     evaluations: Float[Any, " steps"]  # of the surface for one foot, on average
     change: Float[Any, " steps"]  # of the feet's parameters since the iteration before, on average
+    active: Int[Any, " steps"] | None = None  # points that pull
+    shape: Int[Any, "2 steps"] | None = None  # of the net
 
     def at(self, step: Array, *values: Array | float) -> "Records":
         """With the values (average, maximum, evaluations, change) of one iteration."""
         columns = (self.average, self.maximum, self.evaluations, self.change)
-        return Records(*(x.at[step].set(value) for x, value in zip(columns, values, strict=True)))
+        entered = (x.at[step].set(value) for x, value in zip(columns, values, strict=True))
+        average, maximum, evaluations, change = entered
+        return Records(average, maximum, evaluations, change, self.active, self.shape)
+
+    def counting(self, step: Array, active: Array, axes: tuple[Axis, Axis]) -> "Records":
+        """With the number of points that pull, and the size of the net."""
+        if self.active is None or self.shape is None:
+            return self
+        used = jnp.stack([jnp.asarray(axis.used, jnp.int32) for axis in axes])
+        return eqx.tree_at(
+            lambda r: (r.active, r.shape),
+            self,
+            (self.active.at[step].set(active), self.shape.at[:, step].set(used)),
+        )
 
     def is_stalled(self, step: Array, window: int, gain: float) -> Array:
         """Whether neither error has fallen by the share `gain` within `window` iterations."""
@@ -71,6 +89,11 @@ class Turn(eqx.Module):
     net: Float[Any, "nu nv d"]
     step: Int[Any, ""]
     records: Records
+    growth: Growth | None = None  # of a net that gets more knots on the way
+
+    def axes(self, problem: Any) -> tuple[Axis, Axis]:
+        """Both directions of the knots."""
+        return (problem.axis_u, problem.axis_v) if self.growth is None else self.growth.axes
 
 
 class Best(eqx.Module):
@@ -90,6 +113,8 @@ class Carry(eqx.Module):
     measured: Measured
     code: Int[Any, ""]
     best: Best | None  # for methods that may wander off
+    exact: Bool[Any, ""]  # whether `next` is to be measured with feet converged
+    growth: Growth | None  # of `net`
 
 
 class AbstractIterativeMethod(eqx.Module):
@@ -98,8 +123,15 @@ class AbstractIterativeMethod(eqx.Module):
     stall_window: eqx.AbstractVar[int]
     stall_gain: eqx.AbstractVar[float]
 
+    @property
+    def foresees(self) -> bool:
+        """Whether feet between the first surface and the last need not have converged."""
+        return False
+
     @abstractmethod
-    def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
+    def measure(
+        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
+    ) -> Measured:
         """Feet on a surface, warm-started from the last ones, and the errors there."""
 
     @abstractmethod
@@ -107,16 +139,39 @@ class AbstractIterativeMethod(eqx.Module):
         """One or several moves from a net that has been measured, given its pieces."""
 
 
-def begin(net: Any, u: Any, v: Any, most: int, keep_best: bool = False) -> Carry:
-    """Before anything is measured; the history holds up to `most` + 1 entries."""
+def begin(
+    net: Any,
+    u: Any,
+    v: Any,
+    most: int,
+    keep_best: bool = False,
+    growth: Growth | None = None,
+    pulls: bool = False,
+) -> Carry:
+    """Before anything is measured; the history holds up to `most` + 1 entries.
+
+    `growth` is that of a net with room for more, and `pulls` says whether the method gathers them.
+    """
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)
+    number = partial(xp.asarray, dtype=np.int32)
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0)
     empty = xp.full(bucket(most + 1, LEAST_HISTORY), np.nan, net.dtype)
-    number = partial(xp.asarray, dtype=np.int32)
-    turn = Turn(net, number(0), Records(empty, empty, empty, empty))
+    records = Records(empty, empty, empty, empty)
+    if pulls:
+        nothing = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
+        measured = eqx.tree_at(lambda m: m.pulls, measured, Pulls(nothing, number(0)), is_leaf=_is_none)
+        counts = xp.zeros(empty.shape, np.int32)
+        both = (counts, xp.zeros((2, *empty.shape), np.int32))
+        records = eqx.tree_at(lambda r: (r.active, r.shape), records, both, is_leaf=_is_none)
+    turn = Turn(net, number(0), records, growth)
     best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if keep_best else None
-    return Carry(net, number(-1), turn, measured, number(code_of(RESULTS.running)), best)
+    running = number(code_of(RESULTS.running))
+    return Carry(net, number(-1), turn, measured, running, best, xp.asarray(True), growth)
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
 
 
 def code_of(result: Any) -> int:
@@ -152,15 +207,23 @@ def advance(
 
     def body(carry: Carry) -> Carry:
         turn = carry.next
-        pieces = pieces_on(turn.net, problem.axis_u, problem.axis_v)
-        measured = method.measure(problem, pieces, carry.measured)
+        axes = turn.axes(problem)
+        pieces = pieces_on(turn.net, *axes)
+        measured = method.measure(problem, limits, pieces, carry.measured, carry.exact)
         records = turn.records.at(turn.step, *problem.summarise(measured, carry.measured))
-        turn = Turn(turn.net, turn.step, records)
+        if measured.pulls is not None:
+            records = records.counting(turn.step, measured.pulls.active, axes)
+        turn = Turn(turn.net, turn.step, records, turn.growth)
         code = _judge(method, limits, turn)
+        again = jnp.asarray(False)
+        if method.foresees:
+            # No fit ends on feet that are only foreseen.
+            again = ~carry.exact & (code != running) & (code != code_of(RESULTS.diverged))
+            code = jnp.where(again, running, code)
         move = partial(method.move, problem, limits, pieces, measured)
-        following = lax.cond(code == running, move, lambda turn: turn, turn)
+        following = lax.cond((code == running) & ~again, move, lambda turn: turn, turn)
         best = _best(carry.best, turn, measured)
-        good = Carry(turn.net, turn.step, following, measured, code, best)
+        good = Carry(turn.net, turn.step, following, measured, code, best, again, turn.growth)
         # A step into nonsense is taken back, and leaves no trace.
         back = eqx.tree_at(lambda c: c.code, carry, code)
         bad = (code == code_of(RESULTS.diverged)) & (carry.step >= 0)

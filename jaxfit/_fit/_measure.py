@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Bool
 
 from jaxfit._closest import AbstractFootMethod, Border, project
@@ -44,14 +45,20 @@ def measure_feet(
 
 def border(nu: int, nv: int, corners_only: bool) -> Bool[np.ndarray, "nu nv"]:
     """Which control points lie on the border of the net, or only its corners."""
-    end_u, end_v = ends(nu)[:, None], ends(nv)[None, :]
+    return _border(np.arange(nu), np.arange(nv), nu, nv, corners_only)
+
+
+def border_on(axes: tuple[Axis, Axis], shape: tuple[int, ...], corners_only: bool) -> Bool[Array, "nu nv"]:
+    """The same of a net with room for more; the surplus counts as border."""
+    number_u, number_v = jnp.arange(shape[0]), jnp.arange(shape[1])
+    held = _border(number_u, number_v, axes[0].used, axes[1].used, corners_only)
+    return held | (number_u >= axes[0].used)[:, None] | (number_v >= axes[1].used)[None, :]
+
+
+def _border(number_u: Any, number_v: Any, nu: Any, nv: Any, corners_only: bool) -> Any:
+    end_u = ((number_u == 0) | (number_u == nu - 1))[:, None]
+    end_v = ((number_v == 0) | (number_v == nv - 1))[None, :]
     return end_u & end_v if corners_only else end_u | end_v
-
-
-def ends(count: int) -> Bool[np.ndarray, " count"]:
-    """The first and the last of so many."""
-    number = np.arange(count)
-    return (number == 0) | (number == count - 1)
 
 
 def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> Border:

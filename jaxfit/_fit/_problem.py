@@ -26,6 +26,11 @@ class Problem(eqx.Module):
     foot_tolerance: Float[Any, ""]
     lowest: Float[Any, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
 
+    def ordered(self, order: Any) -> "Problem":
+        """The same with its points in another order."""
+        parts = (self.target[:, order], self.weight[order], self.padding[order])
+        return eqx.tree_at(lambda p: (p.target, p.weight, p.padding), self, parts)
+
     def summarise(self, measured: Any, before: Any) -> tuple[Array, Array, Array, Array]:
         """Of the true points: average and maximum error as fractions of the diagonal, then averages of the
         evaluations for a foot and of its change of parameters.
@@ -154,3 +159,13 @@ def padded_start(x: Any, size: int, dtype: Any) -> Array:
         return jnp.asarray(x, dtype)
     x = np.asarray(x)
     return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], size - count)]), dtype)
+
+
+def order_by_cell(axes: tuple[Axis, Axis], u: Any, v: Any, count: int) -> Any:
+    """An order of points, `count` true ones first, in which those of one cell come together: neighbours in
+    memory are then neighbours on the surface, and laying points out in rows is quicker.
+    """
+    xp: Any = np if is_concrete(axes, u, v) else jnp
+    cell = axes[0].locate(u) * axes[1].cells + axes[1].locate(v)
+    padding = np.arange(u.shape[0]) >= count
+    return xp.argsort(xp.where(padding, axes[0].cells * axes[1].cells, cell), stable=True)

@@ -52,6 +52,11 @@ class Axis(eqx.Module):
         return self.bounds.shape[1]
 
     @property
+    def used(self) -> Any:
+        """How many control points have influence: all but those behind surplus knots at the right end."""
+        return self.ends[1] + self.polynomials.shape[1]
+
+    @property
     def low(self) -> Float[Numbers, " cells"]:
         """Lower end of every cell's stretch."""
         return self.bounds[0]
@@ -124,9 +129,9 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     dtype, knots = knots.dtype, np.asarray(knots, np.float64) if concrete else knots
     breaks = knots[order - 1 : knots.shape[0] - order + 1]
     cells = breaks.shape[0] - 1
-    number, knot = xp.arange(cells), xp.arange(cells + 1)
+    number = xp.arange(cells)
     repeats = xp.sum(breaks[:, None] == knots[None, :], axis=1)
-    at_end = (knot == 0) | (knot == cells)
+    at_end = (breaks <= breaks[0]) | (breaks >= breaks[-1])  # more often where there are surplus knots
     crease = (repeats >= max(order - 1, 1)) | at_end
     filled = breaks[1:] > breaks[:-1]
     # The nearest crease to the left and to the right; empty spans neither start nor end a stretch.

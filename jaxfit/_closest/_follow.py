@@ -1,0 +1,53 @@
+"""Feet that follow a moving surface, one step for each of its moves."""
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._cells import Jet, staged
+from jaxfit._closest._feet import LONGEST_STEP, Box, landing, pins, within
+from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
+
+
+def follow(
+    method: AbstractFootMethod,
+    e: Float[Array, "d *shape"],
+    jet: Jet,
+    u: Float[Array, "*shape"],
+    v: Float[Array, "*shape"],
+    box: Box,
+    tolerance: Float[Array, ""],
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "d *shape"]]:
+    r"""One step from feet near their own: where they land, and the residual foreseen there.
+
+    To first order the residual after a step $(\delta u, \delta v)$ is $e - R_u \delta u - R_v \delta v$. A
+    step that would lengthen it is cut to where it is shortest.
+    """
+    always = tolerance < jnp.inf
+    first = staged(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
+    pinned_s, pinned_t, settled = pins(first, u, v, box, tolerance)
+    ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
+    return staged(always, _landed, first, e, jet, u, v, ds, dt, settled, box)
+
+
+def _landed(
+    first: Forms,
+    e: Array,
+    jet: Jet,
+    u: Array,
+    v: Array,
+    ds: Array,
+    dt: Array,
+    settled: Array,
+    box: Box,
+) -> tuple[Array, Array, Array]:
+    ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)
+    ds, dt = within(box, u, v, ds, dt)
+    along = first.gradient_s * ds + first.gradient_t * dt
+    length2 = first.E * ds * ds + 2.0 * first.F * ds * dt + first.G * dt * dt
+    shortest = jnp.maximum(along, 0.0) / jnp.where(length2 > 0, length2, 1.0)
+    share = jnp.where(settled, 0.0, jnp.where(2.0 * along >= length2, 1.0, shortest))
+    ds, dt = share * ds, share * dt
+    next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
+    next_v = landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+    return next_u, next_v, e - ds[None] * jet.s - dt[None] * jet.t
