@@ -43,7 +43,7 @@ def row_moments(
     values: Float[Array, "c rows width"],
     order_u: int,
     order_v: int,
-) -> Float[Array, "rows K L*c"]:
+) -> Float[Array, "rows K Lc"]:
     """Sums over each row of s^a t^b x, the last index running over b and within it over the values x."""
     powers_s, powers_t = _powers(s, order_u), _powers(t, order_v)
     product = (powers_t[:, None] * values[None]).reshape(-1, *s.shape)
@@ -60,7 +60,7 @@ def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order ro
 
 
 def cells_to_net(
-    moments: Float[Array, "cells K L*c"],
+    moments: Float[Array, "cells K Lc"],
     poly_u: Float[Numbers, "spans_u K K"],
     poly_v: Float[Numbers, "spans_v L L"],
 ) -> Float[Array, "nu nv c"]:

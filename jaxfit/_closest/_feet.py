@@ -159,8 +159,11 @@ def advance(
     halvings, steps, _ = feet.whole
     first = _measure_at(method, always, u, v, target, coefficients, box)
     next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, steps > PATIENCE, box, limits)
-    off = jnp.maximum(jnp.abs(u - box.centre_u) * box.rate_u, jnp.abs(v - box.centre_v) * box.rate_v)
-    judged = is_going(feet, limits) & (off <= INSIDE)
+    # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
+    rounding = 8.0 * float(jnp.finfo(u.dtype).eps)
+    off_u = (jnp.abs(u - box.centre_u) - rounding * jnp.abs(u)) * box.rate_u
+    off_v = (jnp.abs(v - box.centre_v) - rounding * jnp.abs(v)) * box.rate_v
+    judged = is_going(feet, limits) & ~(jnp.maximum(off_u, off_v) > INSIDE)
     accepted = first.f <= best + limits.slack(first.f)
     still = (next_u == u) & (next_v == v)
     # What is foreseen rests on the last two steps, so the last one must be whole.

@@ -24,10 +24,12 @@ def project(
     idle: Bool[Array, " points"] | None = None,
     borders: bool = True,
     within: Border | None = None,
+    together: bool = False,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
     they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
-    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
+    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else. `together`:
+    points come in an order in which those of one cell stand together, or nearly so.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -44,9 +46,10 @@ def project(
     if idle is not None:
         feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
     if within is not None:
-        return settle(method, pieces, target, feet, within, limits)
+        return settle(method, pieces, target, feet, within, limits, together)
     if not borders:
-        return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
+        everywhere = _border(pieces, jnp.asarray(EVERYWHERE))
+        return settle(method, pieces, target, feet, everywhere, limits, together)
     return _in_stages(method, pieces, target, feet, limits)
 
 

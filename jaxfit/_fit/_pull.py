@@ -32,7 +32,7 @@ from jaxfit._splines._pieces import Pieces
 class Pulls(eqx.Module):
     """What a pass over the points gives: sum_k w_k N_i N_j e_k and, last, sum_k w_k N_i N_j."""
 
-    sums: Float[Any, "nu nv d+1"]
+    sums: Float[Any, "nu nv c"]
     active: Int[Any, ""]  # points that pull
 
     @property
@@ -45,7 +45,7 @@ class Pulls(eqx.Module):
 
 class _Pass(eqx.Module):
     feet: Float[Array, "3 points"]  # u, v and the length of the residual
-    cells: Float[Array, "cells K L*c"]
+    cells: Float[Array, "cells K Lc"]
     active: Int[Array, ""]
 
 
