@@ -9,6 +9,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 
+LARGEST = 1e150
+
+
 def is_concrete(*trees: Any) -> bool:
     """Whether no leaf of `trees` is a tracer, so that values may be looked at."""
     for tree in trees:
@@ -66,6 +69,11 @@ def check_finite(name: str, x: ArrayLike) -> None:
     """Raise unless every entry of the concrete array `x` is finite."""
     values = np.asarray(x)
     if np.isfinite(values).all():
+        if values.dtype.itemsize >= 8 and max(values.max(), -values.min()) > LARGEST:
+            raise ValueError(
+                f"{name} must be at most {LARGEST:g} in magnitude, so that squares stay within the range of "
+                "float64; scale it down."
+            )
         return
     bad = ~np.isfinite(values)
     first = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -39,7 +39,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             return _fit_command(args, started)
     except KeyboardInterrupt:
-        return _complain("interrupted, nothing more is written.", INTERRUPTED)
+        _complain("interrupted, nothing more is written.", INTERRUPTED)
+        if argv is None:
+            # A computation may still be running, and taking the interpreter down under it crashes.
+            sys.stderr.flush()
+            os._exit(INTERRUPTED)
+        return INTERRUPTED
     except (ValueError, TypeError, OSError) as error:
         return _complain(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:

@@ -264,3 +264,12 @@ def test_a_hood_is_met_to_rounding():
     fit = jf.interpolate(data("hood_beetle_10x10")["grid"])
     assert bool(fit.converged), fit.message
     assert float(fit.maximum_error) <= 1e-12
+
+
+@pytest.mark.float32_too
+def test_a_grid_that_is_met_from_the_start_ends_at_once():
+    # In single precision feet on knots may seem to lie outside their cells.
+    t = np.linspace(0.0, 1.0, 30)
+    grid = np.stack([*np.meshgrid(t, t, indexing="ij"), np.outer(t, t)], axis=-1)
+    fit = jf.interpolate(grid, tolerance=1e-5)
+    assert bool(fit.converged), fit.message

@@ -55,6 +55,9 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
     try:
         part.write_bytes(content)
         os.replace(part, os.path.realpath(path))
+    except OSError as error:
+        reason = error.strerror or error
+        raise OSError(f"{path} cannot be written ({reason}); make room, or name another file.") from error
     finally:
         part.unlink(missing_ok=True)
 
