@@ -24,6 +24,7 @@ from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, padded_start, unit_of
+from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -31,11 +32,13 @@ LEAST_POINTS = 4
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
 MOST_CONTROL_POINTS = 64  # per direction, likewise
 
+ApproximationMethod = GeometricApproximation | StandardApproximation
+
 
 def approximate(
     points: ArrayLike,
     base: BSplineSurface,
-    method: GeometricApproximation | None = None,
+    method: ApproximationMethod | None = None,
     tol_average: float | None = 6e-4,
     tol_maximum: float | None = None,
     max_steps: int = 200,
@@ -52,7 +55,8 @@ def approximate(
         In any order, any unit.
     base : BSplineSurface
         A first approximation, for instance from `base_surface`. Its knots are kept.
-    method : GeometricApproximation, optional
+    method : GeometricApproximation() or StandardApproximation(), optional
+        Default: GeometricApproximation().
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
         diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
@@ -87,7 +91,7 @@ def approximate(
     sizes per octave, so that a second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
-    check_kind("method", method, GeometricApproximation, "GeometricApproximation()")
+    check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     check_number("max_steps", max_steps, 0, whole=True)
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
@@ -100,23 +104,25 @@ def approximate(
     concrete = is_concrete(cloud, base, pulls, start)
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     problem = make_problem(cloud, pulls, axes_of(base, dtype), unit, method.foot_tolerance)
+    if isinstance(method, StandardApproximation):
+        method, problem = method.prepared(problem)
     size = problem.target.shape[1]
     net = jnp.asarray(unit.inward(base.control_points), dtype)
     if start is not None:
         u, v = _checked_start(start, cloud.shape[0])
     elif concrete:
-        u, v, _, _ = global_feet(method, problem, net, cloud.shape[0], max_steps)
+        u, v, _, _ = global_feet(_projector(method), problem, net, cloud.shape[0], max_steps)
     else:
         feet = closest_point(base, cloud)
         u, v = feet.u, feet.v
     u, v = (padded_start(x, size, dtype) for x in (u, v))
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
-    carry = begin(net, u, v, max_steps)
+    carry = begin(net, u, v, max_steps, solves=problem.smoothing is not None)
     carry = run(method, problem, limits, carry, progress if concrete else None)
     surface = _surface(carry, base, net, unit)
     parts = _parts(carry, method, problem, cloud.shape[0], max_steps, concrete)
-    return _finished(carry, parts, unit, surface, concrete, throw)
+    return _finished(carry, problem, parts, unit, surface, concrete, throw)
 
 
 def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
@@ -128,7 +134,7 @@ def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BS
 
 def _parts(
     carry: Carry,
-    method: GeometricApproximation,
+    method: ApproximationMethod,
     problem: Problem,
     count: int,
     max_steps: int,
@@ -144,7 +150,7 @@ def _parts(
         return measured.u, measured.v, errors, measured.found
     parts = (measured.u, measured.v, errors, measured.found)
     u, v, distances, found = (np.array(x)[:count] for x in parts)
-    best = global_feet(method, problem, carry.net, count, max_steps)
+    best = global_feet(_projector(method), problem, carry.net, count, max_steps)
     distance = best[2] / float(problem.diagonal)
     nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
@@ -152,8 +158,21 @@ def _parts(
     return u, v, distances, found
 
 
+def _projector(method: ApproximationMethod) -> ApproximationMethod:
+    """A method whose loop finds feet: the method itself, so that nothing else is compiled, if it does."""
+    if isinstance(method, StandardApproximation) and not method.parameter_correction:
+        return GeometricApproximation(foot_method=method.foot_method, foot_tolerance=method.foot_tolerance)
+    return method
+
+
 def _finished(
-    carry: Carry, parts: Any, unit: Unit, surface: BSplineSurface, concrete: bool, throw: bool
+    carry: Carry,
+    problem: Problem,
+    parts: Any,
+    unit: Unit,
+    surface: BSplineSurface,
+    concrete: bool,
+    throw: bool,
 ) -> Fit:
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, errors = (jax.device_put(x) if concrete else x for x in parts[:3])
@@ -170,8 +189,21 @@ def _finished(
             "num_steps": carry.step,
             "diagonal": unit.diagonal,
             "unconverged_feet": xp.sum(~parts[3]),
+            **_smoothing_stats(carry, problem, unit),
         },
     )
+
+
+def _smoothing_stats(carry: Carry, problem: Problem, unit: Unit) -> dict[str, Any]:
+    """What standard approximation adds."""
+    if problem.smoothing is None:
+        return {}
+    energy = bending_energy(carry.net, problem.axis_u, problem.axis_v)
+    return {
+        "smoothing": problem.smoothing,
+        "bending_energy": energy * unit.scale**2,
+        "shift": carry.next.shift,
+    }
 
 
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
@@ -207,7 +239,7 @@ def fit_points(
     boundary: Boundary | None = None,
     net: tuple[int, int] | None = None,
     order: tuple[int, int] = (4, 4),
-    method: GeometricApproximation | None = None,
+    method: ApproximationMethod | None = None,
     **options: Any,
 ) -> Fit:
     """The whole way from a cloud and its four boundary polylines to a fitted surface.

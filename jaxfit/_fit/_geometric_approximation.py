@@ -104,7 +104,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         step = turn.step + 1
         if self.fairing is not None:
             moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved), moved)
-        return Turn(moved, step, turn.records)
+        return Turn(moved, step, turn.records, turn.shift)
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """Feet from the last ones, converged on the new surface."""

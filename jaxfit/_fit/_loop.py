@@ -71,6 +71,7 @@ class Turn(eqx.Module):
     net: Float[Any, "nu nv d"]
     step: Int[Any, ""]
     records: Records
+    shift: Float[Any, ""] | None = None  # most that a singular system has been shifted, where any is solved
 
 
 class Best(eqx.Module):
@@ -107,14 +108,17 @@ class AbstractIterativeMethod(eqx.Module):
         """One or several moves from a net that has been measured, given its pieces."""
 
 
-def begin(net: Any, u: Any, v: Any, most: int, keep_best: bool = False) -> Carry:
+def begin(
+    net: Any, u: Any, v: Any, most: int, keep_best: bool = False, solves: bool = False
+) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries."""
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0)
     empty = xp.full(bucket(most + 1, LEAST_HISTORY), np.nan, net.dtype)
     number = partial(xp.asarray, dtype=np.int32)
-    turn = Turn(net, number(0), Records(empty, empty, empty, empty))
+    shift = xp.zeros((), net.dtype) if solves else None
+    turn = Turn(net, number(0), Records(empty, empty, empty, empty), shift)
     best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if keep_best else None
     return Carry(net, number(-1), turn, measured, number(code_of(RESULTS.running)), best)
 
@@ -155,7 +159,7 @@ def advance(
         pieces = pieces_on(turn.net, problem.axis_u, problem.axis_v)
         measured = method.measure(problem, pieces, carry.measured)
         records = turn.records.at(turn.step, *problem.summarise(measured, carry.measured))
-        turn = Turn(turn.net, turn.step, records)
+        turn = Turn(turn.net, turn.step, records, turn.shift)
         code = _judge(method, limits, turn)
         move = partial(method.move, problem, limits, pieces, measured)
         following = lax.cond(code == running, move, lambda turn: turn, turn)

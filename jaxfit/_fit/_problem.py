@@ -25,6 +25,7 @@ class Problem(eqx.Module):
     diagonal: Float[Any, ""]
     foot_tolerance: Float[Any, ""]
     lowest: Float[Any, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
+    smoothing: Float[Any, ""] | None = None  # weight of the thin plate, likewise
 
     def summarise(self, measured: Any, before: Any) -> tuple[Array, Array, Array, Array]:
         """Of the true points: average and maximum error as fractions of the diagonal, then averages of the
