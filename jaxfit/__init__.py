@@ -22,6 +22,8 @@ from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
 from jaxfit._fit import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._fit import JaxoptGaussNewton as JaxoptGaussNewton
+from jaxfit._fit import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
 from jaxfit._fit import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._fit import NormalInterpolation as NormalInterpolation
 from jaxfit._fit import OptimalRepositioning as OptimalRepositioning

@@ -12,6 +12,8 @@ from jaxfit._fit._frozen import Richardson as Richardson
 from jaxfit._fit._geometric_approximation import GeometricApproximation as GeometricApproximation
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit._interpolate import interpolate as interpolate
+from jaxfit._fit._jaxopt import JaxoptGaussNewton as JaxoptGaussNewton
+from jaxfit._fit._jaxopt import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
 from jaxfit._fit._least_squares import GaussNewton as GaussNewton
 from jaxfit._fit._least_squares import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation

@@ -54,7 +54,7 @@ class GaussNewton(AbstractLeastSquares):
         import optimistix as optx
 
         linear = StructuredSolver(problem)
-        solver = optx.GaussNewton(1e-8, 1e-8, linear_solver=linear)
+        solver: Any = optx.GaussNewton(1e-8, 1e-8, linear_solver=linear)
         return _minimised(solver, problem, 2), linear.shift
 
 
@@ -82,7 +82,7 @@ class LevenbergMarquardt(AbstractLeastSquares):
         eps = float(jnp.finfo(problem.net.dtype).eps)
         linear = lx.Normal(lx.CG(rtol=10 * eps, atol=10 * eps, max_steps=problem.net.size))
         tolerance = max(self.tolerance, 10 * eps)
-        solver = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
+        solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
         return _minimised(solver, problem, self.max_steps), jnp.zeros((), problem.net.dtype)
 
 
@@ -92,7 +92,7 @@ def _minimised(solver: Any, problem: Posed, steps: int) -> Array:
     def residual(net: Array, problem: Posed) -> Any:
         return problem.residual(net)
 
-    solution = optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
+    solution: Any = optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
     return jnp.where(problem.normal.free[:, :, None], solution.value, problem.net)
 
 
@@ -112,8 +112,7 @@ class StructuredSolver(lx.AbstractLinearSolver):
 
     @property
     def _solver(self) -> Any:
-        entries, net = self.problem.normal.stencil.entries, self.problem.net
-        return normal_solver(net.shape[:2], entries.shape[:2])
+        return normal_solver(self.problem.normal)
 
     @property
     def shift(self) -> Float[Array, ""]:
@@ -127,7 +126,7 @@ class StructuredSolver(lx.AbstractLinearSolver):
     def compute(self, state: tuple[()], vector: Any, options: dict[str, Any]) -> Any:
         """(J^T J)^-1 J^T r."""
         problem = self.problem
-        right = problem.system.adjoint(vector, problem.net.shape)
+        right = problem.system.adjoint(vector)
         right = jnp.where(problem.normal.free[:, :, None], right, 0.0)
         return self._solver.compute(self.state, right, options)
 

@@ -108,9 +108,7 @@ class AbstractIterativeMethod(eqx.Module):
         """One or several moves from a net that has been measured, given its pieces."""
 
 
-def begin(
-    net: Any, u: Any, v: Any, most: int, keep_best: bool = False, solves: bool = False
-) -> Carry:
+def begin(net: Any, u: Any, v: Any, most: int, keep_best: bool = False, solves: bool = False) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries."""
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)

@@ -51,15 +51,16 @@ class StandardApproximation(AbstractIterativeMethod):
 
     Notes
     -----
-    The fit's `stats` say `smoothing`, the lambda in force; `bending_energy`, the integral above in the squared
-    unit of the data; and `shift`, by what share of its diagonal a normal matrix had to be shifted because it
-    was singular to rounding, as without smoothing and with fewer points than a net needs: 0 for a regular one.
+    The fit's `stats` say `smoothing`, the lambda in force; `bending_energy`, the integral above in the
+    squared unit of the data; and `shift`, by what share of its diagonal a normal matrix had to be shifted
+    because it was singular to rounding, as it is without smoothing where points are fewer than a net needs: 0
+    for a regular one.
     """
 
     smoothing: Any = 2e-5
     parameter_correction: bool = True
     fixed_boundary: bool = True
-    solver: AbstractLeastSquares = GaussNewton()
+    solver: Any = GaussNewton()
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 20
@@ -76,8 +77,8 @@ class StandardApproximation(AbstractIterativeMethod):
         value = np.asarray(self.smoothing, np.float64)
         if value.ndim or not 0 <= value < np.inf:
             raise ValueError(
-                f"smoothing must be a finite number of at least 0, but is {self.smoothing!r}; pass lambda, for "
-                "instance 2e-5."
+                f"smoothing must be a finite number of at least 0, but is {self.smoothing!r}; pass "
+                "lambda, for instance 2e-5."
             )
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
@@ -92,7 +93,8 @@ class StandardApproximation(AbstractIterativeMethod):
         nu, nv, _ = turn.net.shape
         held = border(nu, nv, corners_only=not self.fixed_boundary)
         net, shift = self.solver(posed(system_at(problem, pieces, measured.u, measured.v), held, turn.net))
-        return Turn(net, turn.step + 1, turn.records, jnp.maximum(turn.shift, shift))
+        before: Any = turn.shift
+        return Turn(net, turn.step + 1, turn.records, jnp.maximum(before, shift))
 
     def measure(self, problem: Any, pieces: Pieces, measured: Measured) -> Measured:
         """New parameters, or the errors at the old ones."""

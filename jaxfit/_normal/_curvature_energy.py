@@ -42,8 +42,8 @@ def curvature_energy(surface: BSplineSurface, points: int = 6) -> Float[Array, "
     """
     if surface.dimension != 3:
         raise ValueError(
-            f"surface must have 3 coordinates to have curvatures, but has {surface.dimension}; pass a surface "
-            "in space."
+            f"surface must have 3 coordinates to have curvatures, but has {surface.dimension}; pass a "
+            "surface in space."
         )
     net = jnp.asarray(surface.control_points)
     pieces = make_pieces(net, surface.knots_u, surface.knots_v)
@@ -66,7 +66,7 @@ def _density(jet: Jet) -> Float[Array, "cells points"]:
     regular = area > 0
     area = jnp.where(regular, area, 1.0)
     second = (jet.ss, jet.st, jet.tt)
-    l, m, n = (jnp.sum(x * normal, axis=0) for x in second)  # times the root of `area`
-    mean = (e * n - 2.0 * f * m + g * l) / area  # 2 H, likewise
-    gauss = (l * n - m**2) / area
+    ll, m, n = (jnp.sum(x * normal, axis=0) for x in second)  # times the root of `area`
+    mean = (e * n - 2.0 * f * m + g * ll) / area  # 2 H, likewise
+    gauss = (ll * n - m**2) / area
     return jnp.where(regular, (mean**2 - 2.0 * gauss) / jnp.sqrt(area), 0.0)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxfit._cells import Rows
 from jaxfit._normal._stencil import Stencil, overlapped
-from jaxfit._splines._pieces import Axis, Numbers
+from jaxfit._splines._pieces import Axis
 
 # Powers of so many points are held at once, 112 bytes each for bicubic: within the caches' reach, and large
 # enough for several cores.
@@ -52,10 +52,10 @@ def _in_blocks(
     def block(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         start, total = carry
         begin = jnp.minimum(start, s.shape[0] - at_once)
-        parts = [lax.dynamic_slice_in_dim(x, begin, at_once) for x in (rows.cell, s, t, weight)]
+        cell, x, y, w = (lax.dynamic_slice_in_dim(z, begin, at_once) for z in (rows.cell, s, t, weight))
         fresh = begin + jnp.arange(at_once, dtype=jnp.int32) >= start
-        parts[3] = jnp.where(fresh[:, None], parts[3], 0.0)
-        return start + at_once, total + _cell_moments(*parts, size, cells)
+        w = jnp.where(fresh[:, None], w, 0.0)
+        return start + at_once, total + _cell_moments(cell, x, y, w, size, cells)
 
     nothing = jnp.zeros((cells, size[0] * size[1]), s.dtype)
     begin = (jnp.asarray(0, jnp.int32), nothing)
@@ -90,7 +90,7 @@ def _to_stencil(moments: Float[Array, "cells moments"], axis_u: Axis, axis_v: Ax
 
 
 def basis_products(axis: Axis) -> Float[Array, "cells K K moments"]:
-    """N_r N_(r + e) of every span as polynomials, `[span, r, e]`; zero where r + e is none of its functions."""
+    """N_r N_(r + e) of every span as polynomials, `[span, r, e]`; zero where r + e has no function there."""
     polynomials = jnp.asarray(axis.polynomials)
     order = polynomials.shape[1]
     shifted = jnp.pad(polynomials, ((0, 0), (0, order - 1), (0, 0)))

@@ -9,7 +9,7 @@ import lineax as lx
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._normal._cholesky import Factors, factorise, substitute
+from jaxfit._normal._elimination import Factors, factorise, substitute
 from jaxfit._normal._stencil import Stencil
 from jaxfit._splines import _banded
 
@@ -170,8 +170,8 @@ def _mean_band(entries: Float[Array, "K n m"], root: Float[Array, "n m"]) -> Flo
     return jnp.stack([*lower[::-1], jnp.ones(count, entries.dtype), *upper], axis=1)
 
 
-def normal_solver(net: tuple[int, int], order: tuple[int, int]) -> BlockCholesky | TensorCG:
+def normal_solver(operator: NormalOperator) -> BlockCholesky | TensorCG:
     """Block Cholesky while its factors fit in memory comfortably, CG beyond."""
-    (nu, nv), (order_u, order_v) = net, order
+    order_u, order_v, nu, nv = operator.stencil.entries.shape
     size = nu * order_u * nv**2 if nv <= nu else nv * order_v * nu**2
     return BlockCholesky() if size <= MOST_FACTORS else TensorCG()

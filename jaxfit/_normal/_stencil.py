@@ -63,10 +63,8 @@ class Stencil(eqx.Module):
         return self(unit).reshape(nu * nv, nu * nv)
 
 
-def product(
-    along_u: Float[Numbers, "K nu"], along_v: Float[Numbers, "L nv"]
-) -> Float[Numbers, "K L nu nv"]:
-    """Entries of a tensor product of two banded symmetric matrices, given as `band[a, i]` = entry (i, i + a)."""
+def product(along_u: Float[Numbers, "K nu"], along_v: Float[Numbers, "L nv"]) -> Float[Numbers, "K L nu nv"]:
+    """Entries of a tensor product of banded symmetric matrices, given as `band[a, i]` = entry (i, i + a)."""
     return along_u[:, None, :, None] * along_v[None, :, None, :]
 
 

@@ -10,7 +10,6 @@ is of the size points times control points.
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
@@ -27,10 +26,10 @@ from jaxfit._cells import (
 )
 from jaxfit._normal._moments import normal_stencil
 from jaxfit._normal._stencil import Stencil
-from jaxfit._normal._thin_plate import ThinPlate, thin_plate
+from jaxfit._normal._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-Residual = tuple[Float[Array, "d rows width"], tuple[Array, Array, Array]]
+Residual = tuple[Float[Array, "d rows width"], Bending]
 
 
 class System(eqx.Module):
@@ -66,16 +65,12 @@ class System(eqx.Module):
         root = jnp.sqrt(jnp.asarray(self.smoothing, net.dtype))
         return self.data_residual(net), (root * plate[0], root * plate[1], root * plate[2])
 
-    def adjoint(self, residual: Residual, shape: tuple[int, int, int]) -> Float[Array, "nu nv d"]:
+    def adjoint(self, residual: Residual) -> Float[Array, "nu nv d"]:
         """The transposed Jacobian times a residual: half the gradient of F, at `residual(net)`."""
         data, bending = residual
         values = self.root[None] * data
-        sums = net_sums(
-            self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials
-        )
-        net = jax.ShapeDtypeStruct(shape, data.dtype)
-        (smooth,) = jax.linear_transpose(self.plate.residual, net)(bending)
-        return sums + jnp.sqrt(jnp.asarray(self.smoothing, data.dtype)) * smooth
+        sums = net_sums(self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials)
+        return sums + jnp.sqrt(jnp.asarray(self.smoothing, data.dtype)) * self.plate.adjoint(bending)
 
 
 def make_system(
@@ -96,9 +91,9 @@ def make_system(
         root = jnp.sqrt(jnp.where(rows.filled, spread[2], 0.0))
         return s, t, root, spread[3:]
 
-    parts = staged(jnp.max(weight) > 0, laid_out)
+    s, t, root, goal = staged(jnp.max(weight) > 0, laid_out)
     plate = thin_plate(pieces.axis_u, pieces.axis_v)
-    return System(rows, *parts, pieces.axis_u, pieces.axis_v, plate, smoothing)
+    return System(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
 
 
 def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu nv"]:

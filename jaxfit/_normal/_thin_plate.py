@@ -13,19 +13,29 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._cells import horner
 from jaxfit._normal._stencil import Stencil, overlapped, product
 from jaxfit._splines._pieces import Axis, Numbers
 
+# R_uu, sqrt(2) R_uv and R_vv: orders of the derivatives along u and v, and the factor.
+TERMS = ((2, 0, 1.0), (1, 1, 2.0**0.5), (0, 2, 1.0))
+
+Part = Float[Array, "_ _ _"]  # coordinates, Gauss points along u, along v
+Bending = tuple[Part, Part, Part]
+
+
+Root = Float[Numbers, "_ _ _"]  # Gauss points, cells, order
+Roots = tuple[Root, Root, Root]
+
 
 class ThinPlate(eqx.Module):
     """Square roots of the one-dimensional matrices: `roots[d][g, span, r]`, empty spans being zero."""
 
-    roots_u: tuple[Float[Numbers, "g0 cells_u K"], Float[Numbers, "g1 cells_u K"], Float[Numbers, "g2 cells_u K"]]
-    roots_v: tuple[Float[Numbers, "h0 cells_v L"], Float[Numbers, "h1 cells_v L"], Float[Numbers, "h2 cells_v L"]]
+    roots_u: Roots
+    roots_v: Roots
 
     def stencil(self) -> Stencil:
         """The matrix A_fair of (11)."""
@@ -33,14 +43,20 @@ class ThinPlate(eqx.Module):
         v0, v1, v2 = (_gram(root) for root in self.roots_v)
         return Stencil(product(u2, v0) + 2.0 * product(u1, v1) + product(u0, v2))
 
-    def residual(self, net: Float[Array, "nu nv c"]) -> tuple[Array, Array, Array]:
+    def residual(self, net: Float[Array, "nu nv c"]) -> Bending:
         """L P, whose sum of squares is F_s: the three second derivatives at Gauss points, weighted."""
-        parts = []
-        for d, factor in ((2, 1.0), (1, 2.0**0.5), (0, 1.0)):
-            half = _applied(self.roots_u[d], net)
-            whole = _applied(self.roots_v[2 - d], jnp.moveaxis(half, -2, 0))
-            parts.append(factor * whole.reshape(-1, net.shape[2]))
+        x = jnp.moveaxis(net, 2, 0)
+        parts = [
+            _applied(self.roots_v[e], _applied(factor * self.roots_u[d], x, -2), -1) for d, e, factor in TERMS
+        ]
         return parts[0], parts[1], parts[2]
+
+    def adjoint(self, residual: Bending) -> Float[Array, "nu nv c"]:
+        """L^T times such values; of L P the gradient of F_s / 2."""
+        total: Any = 0.0
+        for (d, e, factor), x in zip(TERMS, residual, strict=True):
+            total = total + _spread(factor * self.roots_u[d], _spread(self.roots_v[e], x, -1), -2)
+        return jnp.moveaxis(total, 0, 2)
 
 
 def thin_plate(axis_u: Axis, axis_v: Axis) -> ThinPlate:
@@ -79,9 +95,28 @@ def _gram(root: Float[Numbers, "g cells K"]) -> Float[Array, "K n"]:
     return jnp.stack(bands)
 
 
-def _applied(root: Float[Numbers, "g cells K"], x: Float[Array, "n ..."]) -> Float[Array, "g cells ..."]:
-    """B times `x` along its first axis."""
-    _, cells, order = root.shape
-    rows = root.reshape(*root.shape, *(1,) * (x.ndim - 1))
-    terms: list[Any] = [rows[:, :, r] * x[None, r : r + cells] for r in range(order)]
-    return sum(terms[1:], terms[0])
+def _applied(root: Float[Numbers, "g cells K"], x: Array, axis: int) -> Array:
+    """B times `x` along an axis, -1 or -2; there the Gauss points of all cells, one kind after the other."""
+    count, cells, order = root.shape
+    rows = _beside(root, axis)
+    kinds = []
+    for g in range(count):
+        terms: list[Any] = [rows[g, r] * lax.slice_in_dim(x, r, r + cells, axis=axis) for r in range(order)]
+        kinds.append(sum(terms[1:], terms[0]))
+    return jnp.concatenate(kinds, axis=axis)
+
+
+def _spread(root: Float[Numbers, "g cells K"], y: Array, axis: int) -> Array:
+    """B^T times `y` along an axis."""
+    count, cells, order = root.shape
+    rows = _beside(root, axis)
+    kinds = [lax.slice_in_dim(y, g * cells, (g + 1) * cells, axis=axis) for g in range(count)]
+    terms: list[Any] = [sum(rows[g, r] * x for g, x in enumerate(kinds)) for r in range(order)]
+    return overlapped(terms, cells + order - 1, axis)
+
+
+def _beside(root: Root, axis: int) -> Array:
+    """Ready to broadcast along `axis`, -1 or -2, of three: `[g, r]` holds the values for all cells."""
+    count, cells, order = root.shape
+    rows = jnp.moveaxis(jnp.asarray(root), 2, 1)
+    return rows.reshape(count, order, 1, 1, cells) if axis == -1 else rows.reshape(count, order, 1, cells, 1)
