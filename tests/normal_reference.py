@@ -27,13 +27,13 @@ def design(surface, u, v):
 def thin_plate_matrix(surface):
     """Equation (10) on [0, 1]^2, by Gauss's rule with more points than it takes."""
     total = 0
-    one = [_squares(*x) for x in zip((surface.knots_u, surface.knots_v), surface.shape, strict=True)]
+    one = [squares(*x) for x in zip((surface.knots_u, surface.knots_v), surface.shape, strict=True)]
     for d, factor in ((2, 1), (1, 2), (0, 1)):
         total = total + factor * np.kron(one[0][d], one[1][2 - d])
     return total
 
 
-def _squares(knots, count):
+def squares(knots, count):
     """Integrals of products of derivatives of order 0, 1, 2, the domain being scaled to [0, 1]."""
     knots = np.asarray(knots, float)
     degree = len(knots) - count - 1

@@ -1,4 +1,4 @@
-"""The normal matrix as a `lineax` operator, and its solvers: block Cholesky, and CG for very large nets."""
+"""The normal matrix as a `lineax` operator, and its direct solver."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit._normal._elimination import Factors, factorise, substitute
 from jaxfit._normal._stencil import Stencil
-from jaxfit._splines import _banded
+from jaxfit._normal._tensor_cg import TensorCG
 
 # Factors of more numbers than this (512 MiB in double precision) are not stored: CG takes over.
 MOST_FACTORS = 1 << 26
@@ -101,73 +101,6 @@ class BlockCholesky(lx.AbstractLinearSolver):
     def assume_full_rank(self) -> bool:
         """After shifting it has."""
         return True
-
-
-class TensorCG(lx.AbstractLinearSolver):
-    """Conjugate gradients on a `NormalOperator`, in memory of the size of the net.
-
-    Preconditioned by D^(1/2) (T_u x T_v) D^(1/2), with the diagonal D and the mean over all rows and over
-    all columns of the matrix scaled to unit diagonal: the matrix itself where the data is spread like a
-    product, and near it where its density varies slowly.
-    """
-
-    rtol: float = 1e-10
-    max_steps: int = 1000
-
-    def init(self, operator: Any, options: dict[str, Any]) -> Any:
-        """The operator, and the factors of the preconditioner."""
-        del options
-        return operator, _tensor_factors(operator)
-
-    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> Any:
-        """The solution for one right-hand side."""
-        del options
-        operator, (root, along_u, along_v) = state
-
-        def precondition(x: Array) -> Array:
-            nu, nv, channels = x.shape
-            x = (x / root).reshape(nu, nv * channels)
-            x = _banded.substitute(along_u, x).reshape(nu, nv, channels).transpose(1, 0, 2)
-            x = _banded.substitute(along_v, x.reshape(nv, nu * channels)).reshape(nv, nu, channels)
-            return x.transpose(1, 0, 2) / root
-
-        tag = lx.positive_semidefinite_tag
-        near = lx.FunctionLinearOperator(precondition, operator.in_structure(), tag)
-        inner = lx.CG(self.rtol, 0.0, max_steps=self.max_steps)
-        settings = {"preconditioner": near}
-        return inner.compute(inner.init(operator, settings), vector, settings)
-
-    def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        """The matrix is symmetric."""
-        return state, options
-
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        """The matrix is real."""
-        return state, options
-
-    def assume_full_rank(self) -> bool:
-        """CG stays within the range of a singular matrix, where the right-hand sides of fits lie."""
-        return True
-
-
-def _tensor_factors(operator: NormalOperator) -> tuple[Array, Any, Any]:
-    """The root of the diagonal, and the factored bands along both directions."""
-    free = jnp.asarray(operator.free)
-    entries = jnp.where(free, operator.stencil.entries, 0.0)
-    root = jnp.sqrt(jnp.where(free, operator.stencil.diagonal, 1.0))
-    scaled = root * jnp.where(free, 1.0, jnp.inf)  # couples no fixed control point
-    bands = [_mean_band(entries[:, 0], scaled), _mean_band(entries[0].transpose(0, 2, 1), scaled.T)]
-    along_u, along_v = (_banded.factorise(band) for band in bands)
-    return root[:, :, None], along_u, along_v
-
-
-def _mean_band(entries: Float[Array, "K n m"], root: Float[Array, "n m"]) -> Float[Array, "n band"]:
-    """Entries (i, i + a) scaled to unit diagonal, averaged over the other direction, as a full band."""
-    order, count, _ = entries.shape
-    ahead = jnp.pad(root, ((0, order - 1), (0, 0)), constant_values=jnp.inf)
-    upper = [jnp.mean(entries[a] / (root * ahead[a : a + count]), axis=1) for a in range(1, order)]
-    lower = [jnp.pad(x, (a, 0))[:count] for a, x in enumerate(upper, 1)]
-    return jnp.stack([*lower[::-1], jnp.ones(count, entries.dtype), *upper], axis=1)
 
 
 def normal_solver(operator: NormalOperator) -> BlockCholesky | TensorCG:
