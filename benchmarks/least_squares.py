@@ -140,7 +140,8 @@ def report(title, works, turns, inputs, knots):
         error = rms(knots, results[name], u, v, points)
         ratio = 1e3 * last / middle
         print(
-            f"  {name:<28}{middle:>9.1f} ms  [{low:.1f}, {high:.1f}]  {ratio:>6.2f} times as fast   rms {error:.9e}",
+            f"  {name:<28}{middle:>9.1f} ms  [{low:.1f}, {high:.1f}]  {ratio:>6.2f} times as fast   "
+            f"rms {error:.9e}",
             flush=True,
         )
 

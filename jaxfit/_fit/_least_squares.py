@@ -5,15 +5,18 @@ rounding. Neither needs a Jacobian of points times control points.
 """
 
 from abc import abstractmethod
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._normal import NormalOperator, System, free_points, normal_solver
+from jaxfit._cells import staged
+from jaxfit._normal import NormalOperator, Stencil, System, free_points, normal_solver
 
 
 class Posed(eqx.Module):
@@ -30,8 +33,13 @@ class Posed(eqx.Module):
 
 def posed(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]) -> Posed:
     """The problem of improving `net`, whose control points `held` stay."""
-    stencil = system.stencil()
-    return Posed(system, NormalOperator(stencil, free_points(stencil, held), net.shape[2]), net)
+
+    def matrix(system: System) -> tuple[Stencil, Array]:
+        stencil = system.stencil()
+        return stencil, free_points(stencil, held)
+
+    stencil, free = staged(system.root[0, 0] >= 0, matrix, system)
+    return Posed(system, NormalOperator(stencil, free, net.shape[2]), net)
 
 
 class AbstractLeastSquares(eqx.Module):
@@ -50,12 +58,13 @@ class GaussNewton(AbstractLeastSquares):
     """
 
     def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-        """One step, and the evaluation with which the driver accepts it."""
+        """One step."""
         import optimistix as optx
 
         linear = StructuredSolver(problem)
         solver: Any = optx.GaussNewton(1e-8, 1e-8, linear_solver=linear)
-        return _minimised(solver, problem, 2), linear.shift
+        # The residual is linear, so the first step is the solution; it is not evaluated just to be accepted.
+        return _freed(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
 
 
 class LevenbergMarquardt(AbstractLeastSquares):
@@ -83,17 +92,24 @@ class LevenbergMarquardt(AbstractLeastSquares):
         linear = lx.Normal(lx.CG(rtol=10 * eps, atol=10 * eps, max_steps=problem.net.size))
         tolerance = max(self.tolerance, 10 * eps)
         solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
-        return _minimised(solver, problem, self.max_steps), jnp.zeros((), problem.net.dtype)
+        net = _solution(solver, problem, self.max_steps).value
+        return _freed(problem, net), jnp.zeros((), net.dtype)
 
 
-def _minimised(solver: Any, problem: Posed, steps: int) -> Array:
+def _solution(solver: Any, problem: Posed, steps: int) -> Any:
     import optimistix as optx
 
+    # Of what it is linearised at, the driver stores the arguments instead of a dozen arrays over the points.
+    @partial(jax.checkpoint, prevent_cse=False)
     def residual(net: Array, problem: Posed) -> Any:
         return problem.residual(net)
 
-    solution: Any = optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
-    return jnp.where(problem.normal.free[:, :, None], solution.value, problem.net)
+    return optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
+
+
+def _freed(problem: Posed, net: Array) -> Array:
+    """The free control points of `net`, and the others as they were."""
+    return jnp.where(problem.normal.free[:, :, None], net, problem.net)
 
 
 class StructuredSolver(lx.AbstractLinearSolver):

@@ -68,9 +68,13 @@ class System(eqx.Module):
     def adjoint(self, residual: Residual) -> Float[Array, "nu nv d"]:
         """The transposed Jacobian times a residual: half the gradient of F, at `residual(net)`."""
         data, bending = residual
-        values = self.root[None] * data
-        sums = net_sums(self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials)
+        # A wall, or each of the many sums would compute the residual for itself.
+        sums = staged(self.root[0, 0] >= 0, lambda data: self._sums(data), data)
         return sums + jnp.sqrt(jnp.asarray(self.smoothing, data.dtype)) * self.plate.adjoint(bending)
+
+    def _sums(self, data: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
+        values = self.root[None] * data
+        return net_sums(self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials)
 
 
 def make_system(
@@ -91,7 +95,7 @@ def make_system(
         root = jnp.sqrt(jnp.where(rows.filled, spread[2], 0.0))
         return s, t, root, spread[3:]
 
-    s, t, root, goal = staged(jnp.max(weight) > 0, laid_out)
+    s, t, root, goal = staged(u[0] >= pieces.axis_u.breaks[0], laid_out)
     plate = thin_plate(pieces.axis_u, pieces.axis_v)
     return System(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
 
