@@ -18,6 +18,7 @@ ROOMS = [
     ("_parameters",),
     ("_cells",),
     ("_closest",),
+    ("_normal",),
     ("_base",),
     ("_fit", "_quality"),
     ("io",),

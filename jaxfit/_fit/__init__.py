@@ -13,9 +13,14 @@ from jaxfit._fit._geometric_approximation import GeometricApproximation as Geome
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit._growth import KnotInsertion as KnotInsertion
 from jaxfit._fit._interpolate import interpolate as interpolate
+from jaxfit._fit._jaxopt import JaxoptGaussNewton as JaxoptGaussNewton
+from jaxfit._fit._jaxopt import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
+from jaxfit._fit._least_squares import GaussNewton as GaussNewton
+from jaxfit._fit._least_squares import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation
 from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight
 from jaxfit._fit._repositioning import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit._repositioning import UnitWeights as UnitWeights
 from jaxfit._fit._results import RESULTS as RESULTS
+from jaxfit._fit._standard_approximation import StandardApproximation as StandardApproximation
 from jaxfit._fit._standard_interpolation import StandardInterpolation as StandardInterpolation

@@ -25,6 +25,7 @@ from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
+from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -32,11 +33,13 @@ LEAST_POINTS = 4
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
 MOST_CONTROL_POINTS = 64  # per direction, likewise
 
+ApproximationMethod = GeometricApproximation | StandardApproximation
+
 
 def approximate(
     points: ArrayLike,
     base: BSplineSurface,
-    method: GeometricApproximation | None = None,
+    method: ApproximationMethod | None = None,
     tol_average: float | None = 6e-4,
     tol_maximum: float | None = None,
     max_steps: int = 200,
@@ -53,7 +56,8 @@ def approximate(
         In any order, any unit.
     base : BSplineSurface
         A first approximation, for instance from `base_surface`. Its knots are kept.
-    method : GeometricApproximation, optional
+    method : GeometricApproximation() or StandardApproximation(), optional
+        Default: GeometricApproximation().
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
         diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
@@ -88,7 +92,7 @@ def approximate(
     sizes per octave, so that a second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
-    check_kind("method", method, GeometricApproximation, "GeometricApproximation()")
+    check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     check_number("max_steps", max_steps, 0, whole=True)
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
@@ -102,6 +106,8 @@ def approximate(
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
+    if isinstance(method, StandardApproximation):
+        method, problem = method.prepared(problem)
     size = problem.target.shape[1]
     begun = net = jnp.asarray(unit.inward(base.control_points), dtype)
     growth = None
@@ -111,7 +117,7 @@ def approximate(
     if start is not None:
         u, v = _checked_start(start, cloud.shape[0])
     elif concrete:
-        u, v, _, _ = global_feet(method, problem, net, growth, cloud.shape[0], max_steps)
+        u, v, _, _ = global_feet(_projector(method), problem, net, growth, cloud.shape[0], max_steps)
     else:
         feet = closest_point(base, cloud)
         u, v = feet.u, feet.v
@@ -119,11 +125,11 @@ def approximate(
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     together = order_by_cell(axes, u, v, cloud.shape[0])
-    carry = begin(net, u[together], v[together], max_steps, growth=growth, pulls=True)
+    carry = begin(method, net, u[together], v[together], max_steps, growth)
     carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
     surface = _surface(carry, base, begun, unit)
     parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
-    return _finished(carry, method, parts, unit, surface, concrete, throw)
+    return _finished(carry, method, problem, parts, unit, surface, concrete, throw)
 
 
 def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
@@ -145,7 +151,7 @@ def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BS
 
 def _parts(
     carry: Carry,
-    method: GeometricApproximation,
+    method: ApproximationMethod,
     problem: Problem,
     order: Any,
     count: int,
@@ -163,7 +169,7 @@ def _parts(
         return tuple(x[back] for x in parts)
     place = np.argsort(order)[:count]
     u, v, distances, found = (np.asarray(x)[place] for x in parts)
-    best = global_feet(method, problem, carry.net, carry.growth, count, max_steps)
+    best = global_feet(_projector(method), problem, carry.net, carry.growth, count, max_steps)
     distance = best[2] / float(problem.diagonal)
     nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
@@ -171,9 +177,17 @@ def _parts(
     return u, v, distances, found
 
 
+def _projector(method: ApproximationMethod) -> ApproximationMethod:
+    """A method whose loop finds feet: the method itself, so that nothing else is compiled, if it does."""
+    if isinstance(method, StandardApproximation) and not method.parameter_correction:
+        return GeometricApproximation(foot_method=method.foot_method, foot_tolerance=method.foot_tolerance)
+    return method
+
+
 def _finished(
     carry: Carry,
-    method: GeometricApproximation,
+    method: ApproximationMethod,
+    problem: Problem,
     parts: Any,
     unit: Unit,
     surface: BSplineSurface,
@@ -195,8 +209,22 @@ def _finished(
             "num_steps": carry.step,
             "diagonal": unit.diagonal,
             "unconverged_feet": xp.sum(~parts[3]),
+            **_smoothing_stats(carry, problem, unit),
         },
     )
+
+
+def _smoothing_stats(carry: Carry, problem: Problem, unit: Unit) -> dict[str, Any]:
+    """What standard approximation adds."""
+    if problem.smoothing is None:
+        return {}
+    axes = (problem.axis_u, problem.axis_v) if carry.growth is None else carry.growth.axes
+    energy = bending_energy(carry.net, *axes)
+    return {
+        "smoothing": problem.smoothing,
+        "bending_energy": energy * unit.scale**2,
+        "shift": carry.next.shift,
+    }
 
 
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
@@ -232,7 +260,7 @@ def fit_points(
     boundary: Boundary | None = None,
     net: tuple[int, int] | None = None,
     order: tuple[int, int] = (4, 4),
-    method: GeometricApproximation | None = None,
+    method: ApproximationMethod | None = None,
     **options: Any,
 ) -> Fit:
     """The whole way from a cloud and its four boundary polylines to a fitted surface.

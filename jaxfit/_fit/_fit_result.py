@@ -103,7 +103,7 @@ def history_of(carry: Carry, method: Any = None) -> History:
         # Cut by NumPy: by JAX, every new length would be a new compilation.
         columns = [np.asarray(x)[: int(carry.step) + 1] for x in columns]
     if records.shape is not None:
-        columns += _marks(columns[-1], method.fairing)
+        columns += _marks(columns[-1], getattr(method, "fairing", None))
     return History(*(jax.device_put(columns) if concrete else columns))
 
 

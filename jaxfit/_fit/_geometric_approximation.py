@@ -1,7 +1,7 @@
 """Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from jax import Array, lax
 
 from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
-from jaxfit._fit._growth import KnotInsertion, refined
+from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._pull import pull
@@ -68,6 +68,9 @@ class GeometricApproximation(AbstractIterativeMethod):
     stall_window: int = 40
     stall_gain: float = 2e-3
 
+    counts: ClassVar[bool] = True
+    gathers: ClassVar[bool] = True
+
     @classmethod
     def paper(cls, **changes: Any) -> "GeometricApproximation":
         """Section 4 as printed: no relaxation, converged feet, fairing, and new knots.
@@ -106,12 +109,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             outside = border_on(axes, net.shape, corners_only=False)
             moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved, outside), moved)
         if self.insertion is not None and growth is not None:
-            error = jnp.where(problem.padding > 0, measured.error, 0.0)
-            moved, growth = lax.cond(
-                step % self.insertion.every == 0,
-                lambda: refined(moved, growth, measured.u, measured.v, error),
-                lambda: (moved, growth),
-            )
+            moved, growth = self.insertion(step, moved, growth, measured, problem.padding > 0)
         return Turn(moved, step, turn.records, growth)
 
     def measure(
@@ -126,16 +124,16 @@ class GeometricApproximation(AbstractIterativeMethod):
                 self.foot_method, problem, pieces, measured, idle, borders=False, together=True
             )
 
-        bare = eqx.tree_at(lambda m: m.pulls, measured, None)
+        bare = eqx.tree_at(lambda m: (m.active, m.pulls), measured, (None, None))
         here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
         follower = self.foot_method if self.foresees else None
         weigh = partial(self._weigh, problem, limits)
-        feet, pulls = pull(problem, pieces, here.u, here.v, idle, weigh, follower)
+        feet, pulls, active = pull(problem, pieces, here.u, here.v, idle, weigh, follower)
         if self.foresees:
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
             steps = jnp.where(exact, here.steps, 1)
             here = Measured(u, v, error, steps, here.found)
-        return Measured(here.u, here.v, here.error, here.steps, here.found, pulls)
+        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls)
 
     def _weigh(self, problem: Any, limits: Limits, weight: Array, error: Array) -> Array:
         """How much points with these errors pull."""

@@ -1,6 +1,6 @@
 """Geometric interpolation of grids: section 3 of the paper."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -91,6 +91,8 @@ class GeometricInterpolation(AbstractIterativeMethod):
     adjoint: AbstractAdjoint = UnrolledAdjoint()
     stall_window: int = 40
     stall_gain: float = 0.1
+
+    keeps_best: ClassVar[bool] = True
 
     def __check_init__(self) -> None:
         for name, kind, example in (

@@ -41,6 +41,17 @@ class KnotInsertion(eqx.Module):
         check_number("every", self.every, 1, whole=True)
         check_number("most", self.most, 0, whole=True)
 
+    def __call__(
+        self, step: Array, net: Array, growth: "Growth", measured: Any, real: Any
+    ) -> tuple[Array, "Growth"]:
+        """The net after iteration `step`, refined if it is time; of the points only `real` ones count."""
+        error = jnp.where(real, measured.error, 0.0)
+        return lax.cond(
+            step % self.every == 0,
+            lambda: refined(net, growth, measured.u, measured.v, error),
+            lambda: (net, growth),
+        )
+
     def room(self, max_steps: int) -> int:
         """Control points to be added along either direction at most."""
         return min(self.most, max_steps // self.every)

@@ -7,7 +7,7 @@ loop measures, records, decides, and moves; it ends on a surface that has been m
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -37,6 +37,7 @@ class Measured(eqx.Module):
     error: Float[Any, " points"]
     steps: Int[Any, " points"]
     found: Bool[Any, " points"]
+    active: Int[Any, ""] | None = None  # points of a cloud that play a part
     pulls: Pulls | None = None  # of methods that gather them while they measure
 
 
@@ -90,6 +91,7 @@ class Turn(eqx.Module):
     step: Int[Any, ""]
     records: Records
     growth: Growth | None = None  # of a net that gets more knots on the way
+    shift: Float[Any, ""] | None = None  # most that a singular system has been shifted, where any is solved
 
     def axes(self, problem: Any) -> tuple[Axis, Axis]:
         """Both directions of the knots."""
@@ -123,6 +125,12 @@ class AbstractIterativeMethod(eqx.Module):
     stall_window: eqx.AbstractVar[int]
     stall_gain: eqx.AbstractVar[float]
 
+    # What else goes round the loop.
+    keeps_best: ClassVar[bool] = False  # the best net that has been measured
+    counts: ClassVar[bool] = False  # how many points play a part, and the size of the net
+    gathers: ClassVar[bool] = False  # pulls, while it measures
+    solves: ClassVar[bool] = False  # systems that may be singular
+
     @property
     def foresees(self) -> bool:
         """Whether feet between the first surface and the last need not have converged."""
@@ -140,38 +148,31 @@ class AbstractIterativeMethod(eqx.Module):
 
 
 def begin(
-    net: Any,
-    u: Any,
-    v: Any,
-    most: int,
-    keep_best: bool = False,
-    growth: Growth | None = None,
-    pulls: bool = False,
+    method: AbstractIterativeMethod, net: Any, u: Any, v: Any, most: int, growth: Growth | None = None
 ) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries.
 
-    `growth` is that of a net with room for more, and `pulls` says whether the method gathers them.
+    `growth` is that of a net with room for more.
     """
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)
     number = partial(xp.asarray, dtype=np.int32)
-    measured = Measured(u, v, xp.zeros_like(u), none, none > 0)
     empty = xp.full(bucket(most + 1, LEAST_HISTORY), np.nan, net.dtype)
-    records = Records(empty, empty, empty, empty)
-    if pulls:
-        nothing = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
-        measured = eqx.tree_at(lambda m: m.pulls, measured, Pulls(nothing, number(0)), is_leaf=_is_none)
-        counts = xp.zeros(empty.shape, np.int32)
-        both = (counts, xp.zeros((2, *empty.shape), np.int32))
-        records = eqx.tree_at(lambda r: (r.active, r.shape), records, both, is_leaf=_is_none)
-    turn = Turn(net, number(0), records, growth)
-    best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if keep_best else None
+    counts, sizes, nothing, shift = None, None, None, None
+    if method.counts:
+        counts, sizes = xp.zeros(empty.shape, np.int32), xp.zeros((2, *empty.shape), np.int32)
+        nothing = number(0)
+    if method.gathers:
+        sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
+    if method.solves:
+        shift = xp.zeros((), net.dtype)
+    measured = Measured(
+        u, v, xp.zeros_like(u), none, none > 0, nothing, Pulls(sums) if method.gathers else None
+    )
+    turn = Turn(net, number(0), Records(empty, empty, empty, empty, counts, sizes), growth, shift)
+    best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if method.keeps_best else None
     running = number(code_of(RESULTS.running))
     return Carry(net, number(-1), turn, measured, running, best, xp.asarray(True), growth)
-
-
-def _is_none(x: Any) -> bool:
-    return x is None
 
 
 def code_of(result: Any) -> int:
@@ -211,9 +212,9 @@ def advance(
         pieces = pieces_on(turn.net, *axes)
         measured = method.measure(problem, limits, pieces, carry.measured, carry.exact)
         records = turn.records.at(turn.step, *problem.summarise(measured, carry.measured))
-        if measured.pulls is not None:
-            records = records.counting(turn.step, measured.pulls.active, axes)
-        turn = Turn(turn.net, turn.step, records, turn.growth)
+        if measured.active is not None:
+            records = records.counting(turn.step, measured.active, axes)
+        turn = eqx.tree_at(lambda t: t.records, turn, records)
         code = _judge(method, limits, turn)
         again = jnp.asarray(False)
         if method.foresees:

@@ -25,6 +25,7 @@ class Problem(eqx.Module):
     diagonal: Float[Any, ""]
     foot_tolerance: Float[Any, ""]
     lowest: Float[Any, ""] | None = None  # eigenvalue of a grid's collocation matrix, where a method asks
+    smoothing: Float[Any, ""] | None = None  # weight of the thin plate, likewise
 
     def ordered(self, order: Any) -> "Problem":
         """The same with its points in another order."""

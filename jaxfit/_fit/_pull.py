@@ -33,7 +33,6 @@ class Pulls(eqx.Module):
     """What a pass over the points gives: sum_k w_k N_i N_j e_k and, last, sum_k w_k N_i N_j."""
 
     sums: Float[Any, "nu nv c"]
-    active: Int[Any, ""]  # points that pull
 
     @property
     def means(self) -> Float[Array, "nu nv d"]:
@@ -57,8 +56,8 @@ def pull(
     idle: Bool[Array, " points"],
     weigh: Callable[[Array, Array], Array],
     method: AbstractFootMethod | None,
-) -> tuple[Float[Array, "3 points"], Pulls]:
-    """The sums at the feet (u, v), and the feet with the lengths of their residuals.
+) -> tuple[Float[Array, "3 points"], Pulls, Int[Array, ""]]:
+    """The feet with the lengths of their residuals, the sums there, and how many points pull.
 
     `weigh(weight, error)` says how much points pull; with a `method` each foot first takes one of its steps,
     and its residual is the one foreseen.
@@ -94,7 +93,7 @@ def pull(
     zero = jnp.asarray(0, jnp.int32)
     done = lax.while_loop(lambda x: x[0] < rows.used, block, (zero, begin))[1]
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
-    return done.feet, Pulls(sums, done.active)
+    return done.feet, Pulls(sums), done.active
 
 
 def _step(

@@ -1,0 +1,148 @@
+"""Standard approximation: every round is the least-squares fit of (8), whatever solves it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations, eps, wavy_cloud
+from normal_reference import design, thin_plate_matrix
+
+import jaxfit as jf
+from jaxfit._fit._least_squares import posed
+from jaxfit._fit._measure import border
+from jaxfit._normal import make_system
+from jaxfit._splines._pieces import make_pieces
+
+POINTS, EDGES = wavy_cloud(500)
+BOUNDARY = jf.Boundary(**EDGES)
+SMOOTHING = 1e-3
+
+
+@pytest.fixture(scope="module")
+def base():
+    return jf.base_surface(BOUNDARY, net=(8, 7))
+
+
+@pytest.fixture(scope="module")
+def one(base):
+    method = jf.StandardApproximation(smoothing=SMOOTHING)
+    return jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
+
+
+def dense_solution(base, smoothing, corners_only=False, weights=None):
+    """One round in plain NumPy, at the true feet on the base."""
+    feet = jf.closest_point(base, POINTS)
+    a = design(base, feet.u, feet.v)
+    weights = np.ones(len(POINTS)) if weights is None else weights
+    matrix = a.T @ (weights[:, None] * a) + smoothing * thin_plate_matrix(base)
+    right = a.T @ (weights[:, None] * POINTS)
+    before = np.asarray(base.control_points).reshape(-1, 3)
+    nu, nv = base.shape
+    number = np.arange(nu * nv).reshape(nu, nv)
+    side = number[[0, 0, -1, -1], [0, -1, 0, -1]] if corners_only else np.r_[number[[0, -1]].ravel()]
+    held = np.isin(number, side).ravel() | (not corners_only) & np.isin(number, number[:, [0, -1]]).ravel()
+    after = before.copy()
+    free = ~held
+    right = right[free] - matrix[np.ix_(free, held)] @ before[held]
+    after[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
+    return after.reshape(nu, nv, 3)
+
+
+def apart(fit, net):
+    return np.abs(np.asarray(fit.surface.control_points) - net).max()
+
+
+def test_one_round_is_the_least_squares_fit(base, one):
+    assert apart(one, dense_solution(base, SMOOTHING)) < 1e-10
+    assert float(one.stats["shift"]) == 0
+    energy = np.asarray(one.surface.control_points).reshape(-1, 3)
+    energy = np.einsum("ic,ij,jc", energy, thin_plate_matrix(base), energy)
+    assert abs(float(one.stats["bending_energy"]) - energy) < 1e-9 * energy
+    assert float(one.stats["smoothing"]) == SMOOTHING
+
+
+def test_weights_and_a_free_boundary(base):
+    weights = np.random.default_rng(1).uniform(0.1, 3, 500)
+    method = jf.StandardApproximation(smoothing=SMOOTHING, fixed_boundary=False)
+    fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9, weights=weights)
+    assert apart(fit, dense_solution(base, SMOOTHING, True, weights)) < 1e-10
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [jf.GaussNewton(), jf.LevenbergMarquardt(), jf.JaxoptGaussNewton(), jf.JaxoptLevenbergMarquardt()],
+)
+def test_every_driver_finds_the_same_control_points(base, one, solver):
+    feet = jf.closest_point(base, POINTS)
+    pieces = make_pieces(*(np.asarray(x) for x in (base.control_points, base.knots_u, base.knots_v)))
+
+    @jax.jit
+    def solved(pieces, net, u, v, points):
+        system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
+        return solver(posed(system, border(8, 7, corners_only=False), net))[0]
+
+    net = solved(pieces, base.control_points, feet.u, feet.v, POINTS)
+    assert apart(one, np.asarray(net)) < 1e-8
+
+
+@pytest.mark.float32_too
+def test_rounds_of_parameter_correction_reach_the_tolerance(base):
+    fit = jf.approximate(POINTS, base, jf.StandardApproximation(), tol_average=3e-4)
+    assert bool(fit.converged), fit.message
+    assert int(fit.stats["num_steps"]) < 10
+    distance = np.asarray(jf.closest_point(fit.surface, POINTS).distance) / fit.stats["diagonal"]
+    assert np.abs(np.asarray(fit.errors) - distance).max() < 100 * eps() + 1e-9
+
+
+def test_another_smoothing_compiles_nothing(base, one):
+    method = jf.StandardApproximation(smoothing=1e-6)
+    with count_compilations() as compiled:
+        jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
+    assert compiled.count == 0
+
+
+def test_without_parameter_correction_one_solve_is_the_fit(base, one):
+    method = jf.StandardApproximation(smoothing=SMOOTHING, parameter_correction=False)
+    fit = jf.approximate(POINTS, base, method, tol_average=1e-9)
+    assert fit.result == jf.RESULTS.stalled
+    assert int(fit.stats["num_steps"]) == 2
+    assert apart(fit, np.asarray(one.surface.control_points)) < 1e-12
+    assert np.abs(np.asarray(fit.errors) - np.asarray(one.errors)).max() < 1e-9
+    assert float(fit.average_error) <= float(fit.history.average[-1])
+
+
+def test_a_singular_system_is_shifted_and_says_so(base):
+    few = POINTS[POINTS[:, 0] < 0.5][:20]
+    method = jf.StandardApproximation(smoothing=0.0)
+    fit = jf.approximate(few, base, method, max_steps=1, tol_average=1e-12)
+    net = np.asarray(fit.surface.control_points)
+    assert float(fit.stats["shift"]) > 0
+    assert np.isfinite(net).all()
+    assert fit.average_error < 0.1 * fit.history.average[0]
+    assert (net[-2:] == np.asarray(base.control_points)[-2:]).all()
+
+
+def test_fits_in_transformations(base):
+    feet = jf.closest_point(base, POINTS)
+    start = (feet.u, feet.v)
+
+    def net(points, smoothing):
+        method = jf.StandardApproximation(smoothing=smoothing)
+        fit = jf.approximate(points, base, method, max_steps=1, tol_average=1e-9, start=start)
+        return fit.surface.control_points
+
+    values = jnp.asarray([SMOOTHING, 1e-6])
+    both = jax.jit(jax.vmap(net, in_axes=(None, 0)))(jnp.asarray(POINTS), values)
+    assert np.abs(np.asarray(both[0]) - dense_solution(base, SMOOTHING)).max() < 1e-10
+    assert np.abs(np.asarray(both[1]) - dense_solution(base, 1e-6)).max() < 1e-10
+
+
+@pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
+def test_impossible_smoothing_gets_a_sentence(value):
+    with pytest.raises(ValueError, match="smoothing must be a finite number"):
+        jf.StandardApproximation(smoothing=value)
+
+
+def test_a_solver_of_another_kind_gets_a_sentence():
+    with pytest.raises(TypeError, match="solver must be an object"):
+        jf.StandardApproximation(solver="cholesky")
