@@ -4,6 +4,7 @@ __version__ = "0.1.0"
 
 from jaxfit._base import Boundary as Boundary
 from jaxfit._base import Coons as Coons
+from jaxfit._base import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base import Greville as Greville
 from jaxfit._base import Meshless as Meshless
 from jaxfit._base import Uniform as Uniform
