@@ -5,7 +5,7 @@ import operator
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._base._boundary import Boundary, diagonal, middle
+from jaxfit._base._boundary import Boundary, farthest, frame
 from jaxfit._base._cloud import Cloud, cloud_of
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
@@ -46,7 +46,7 @@ def base_surface(
         Four polylines in d dimensions, any unit, any number of vertices.
     points : array (N, d), optional
         The cloud. The Coons surface does not look inside: for it the cloud serves only to measure
-        the bounding-box diagonal, of which `tolerance` is a fraction. The other methods need it.
+        the size, of which `tolerance` is a fraction. The other methods need it.
     net : (nu, nv), optional
         Control points along u and v, exactly. Without it each curve takes as many as `tolerance`
         asks for (at least its order, at most 64), and the net is the refinement of opposite
@@ -57,8 +57,9 @@ def base_surface(
     order : (K, L)
         Degree + 1 along u and v, each 2 to 8.
     tolerance : float
-        How far from the reduced polyline, as a fraction of the diagonal, Douglas-Peucker may
-        leave a vertex (default 5e-3). The fitted curves are closer on average (0.02 to 0.2 % of
+        How far from the reduced polyline Douglas-Peucker may leave a vertex, as a fraction of the size
+        (default 5e-3): twice the greatest distance of any point from the boundary's centre of gravity,
+        which is the diagonal of a rectangle. The fitted curves are closer on average (0.02 to 0.2 % of
         the diagonal on scans); a rough outline may be rounded off by twice the tolerance. With
         `net` all vertices are spread by deviation and length, and `tolerance` matters little:
         pieces straight to within a fifth of it are split in the middle.
@@ -92,9 +93,10 @@ def base_surface(
     clouds = [] if points is None else [np.asarray(as_points("points", points, dimension))]
     _check_cloud(method, clouds, points)
     # Centred and of size one, so that neither units nor coordinates in the millions matter.
-    centre, size = middle(*sides), diagonal(*sides)
+    centre, size = frame(sides)
     lines = [(x.astype(float) - centre) / size for x in sides]
-    curves = _curves(lines, net, order, tolerance * diagonal(*sides, *clouds) / size, dtype)
+    reach = 2 * farthest(centre, *sides, *clouds)
+    curves = _curves(lines, net, order, tolerance * reach / size, dtype)
     controls, knots = zip(*curves, strict=True)
     blend = coons_net(
         controls, knots[0], knots[2], method.abscissae if isinstance(method, Coons) else abscissae

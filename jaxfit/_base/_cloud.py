@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfit._base._boundary import Boundary, diagonal, middle
+from jaxfit._base._boundary import Boundary, frame
 
 
 class Cloud(NamedTuple):
-    """Distinct points and boundary polylines, centred and divided by the diagonal of both together."""
+    """Distinct points and boundary polylines, centred and divided by the size of the boundary."""
 
     points: Float[Any, "distinct d"]
     number: Int[Any, " points"]  # which of these each point handed in is
@@ -21,12 +21,12 @@ class Cloud(NamedTuple):
 def cloud_of(points: Float[Any, "points d"], boundary: Boundary) -> Cloud:
     """The cloud in the boundary's frame of size one.
 
-    Points are sorted by their distance from the mean of the box around the boundary, then by coordinates:
+    Points are sorted by their distance from the boundary's centre of gravity, then by coordinates:
     no sum depends on the order they came in, and every so-many-th of them is an even choice.
     """
     sides = [np.asarray(x, float) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
     given = np.asarray(points, float)
-    centre, size = middle(*sides), diagonal(*sides)
+    centre, size = frame(sides)
     distinct, number = np.unique((given - centre) / size, axis=0, return_inverse=True)
     order = np.argsort(np.linalg.norm(distinct, axis=1), kind="stable")
     place = np.empty(len(order), int)

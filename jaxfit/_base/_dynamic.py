@@ -12,7 +12,6 @@ from jaxfit._base._method import AbstractBaseMethod, Knots
 from jaxfit._base._pull import mean_distance, pull, reach_of
 from jaxfit._checks import check_number
 
-
 GAIN = 0.01  # a mean distance has fallen if it did so by this share
 IDLE = 2  # grids that lower nothing before the end
 

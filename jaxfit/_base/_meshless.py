@@ -39,7 +39,7 @@ class Meshless(AbstractBaseMethod):
         Rounds in which points lose weight, $w = 1 / (1 + (r / 20 \bar r)^2)$ with r their distance and
         $\bar r$ the median (default 3), so that gross outliers do not pull.
     most_points : int
-        A larger cloud is thinned evenly to so many (default 50,000).
+        A larger cloud is thinned evenly to so many (default 30,000).
 
     Notes
     -----
@@ -56,7 +56,7 @@ class Meshless(AbstractBaseMethod):
     reweightings: int = 4
     smoothing: float = 1e-5
     robust: int = 3
-    most_points: int = 50_000
+    most_points: int = 30_000
 
     def __check_init__(self) -> None:
         check_number("neighbours", self.neighbours, 6, whole=True)
