@@ -12,6 +12,9 @@ from jaxfit._base._reparametrise import along_sides
 from jaxfit._base._thin_plate import robust_held_fit
 from jaxfit._checks import check_number
 
+FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
+STIFFENINGS = 12  # most rises of the smoothing
+
 
 class Meshless(AbstractBaseMethod):
     r"""Parameters from `meshless_parameters`, then a smoothed least-squares surface at them.
@@ -34,7 +37,9 @@ class Meshless(AbstractBaseMethod):
         Default 4; see `meshless_parameters`.
     smoothing : float
         $\lambda$, as a multiple of the ratio of the traces of the two matrices (default 1e-5, at least
-        1e-10). Where there are no points, the thin plate alone decides.
+        1e-10). Where there are no points, the thin plate alone decides. It is raised tenfold as long as
+        control points lie twice as far out as any point: where points crowd in a corner of the domain, a
+        slack plate would shoot out beside them.
     robust : int
         Rounds in which points lose weight, $w = 1 / (1 + (r / 20 \bar r)^2)$ with r their distance and
         $\bar r$ the median (default 3), so that gross outliers do not pull.
@@ -79,4 +84,11 @@ class Meshless(AbstractBaseMethod):
         points = thinned(cloud.points, self.most_points)
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
-        return robust_held_fit(net, knots, order, places, points, self.smoothing, self.robust)
+        most = FARTHEST * max(float(np.abs(x).max()) for x in (points, *cloud.sides))
+        smoothing = self.smoothing
+        for _ in range(STIFFENINGS):
+            found = robust_held_fit(net, knots, order, places, points, smoothing, self.robust)
+            if np.abs(found).max() <= most:
+                break
+            smoothing *= 10
+        return found
