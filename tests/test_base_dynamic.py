@@ -93,8 +93,8 @@ def test_host_splines_are_those_of_the_package():
 
 
 def test_order_of_points_and_place_do_not_matter():
-    points, boundary = bump(500)
-    points = np.concatenate([points, points[:100]])
+    points, boundary = bump(200)
+    points = np.concatenate([points, points[:50]])
     rng = np.random.default_rng(0)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
@@ -137,8 +137,8 @@ def test_poor_clouds_give_finite_surfaces_within_reach(kind):
 def test_a_scanned_head_that_overhangs():
     arrays = helpers.data("mannequin_head")
     boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
-    method = jf.DynamicBaseSurface(most_points=2000)
-    surface = jf.base_surface(boundary, arrays["points"], (24, 24), method=method)
+    method = jf.DynamicBaseSurface(most_points=1000)
+    surface = jf.base_surface(boundary, arrays["points"], (16, 16), method=method)
     assert mean_error(surface, arrays["points"]) < 1.5e-2
 
 
