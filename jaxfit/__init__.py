@@ -3,10 +3,14 @@
 __version__ = "0.1.0"
 
 from jaxfit._base import Boundary as Boundary
+from jaxfit._base import Coons as Coons
+from jaxfit._base import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base import Greville as Greville
+from jaxfit._base import Meshless as Meshless
 from jaxfit._base import Uniform as Uniform
 from jaxfit._base import base_surface as base_surface
 from jaxfit._base import coons_surface as coons_surface
+from jaxfit._base import meshless_parameters as meshless_parameters
 from jaxfit._closest import ClosestPoint as ClosestPoint
 from jaxfit._closest import HuWallner as HuWallner
 from jaxfit._closest import Newton as Newton

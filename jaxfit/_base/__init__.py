@@ -6,3 +6,8 @@ from jaxfit._base._coons import AbstractAbscissae as AbstractAbscissae
 from jaxfit._base._coons import Greville as Greville
 from jaxfit._base._coons import Uniform as Uniform
 from jaxfit._base._coons import coons_surface as coons_surface
+from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
+from jaxfit._base._meshless import Meshless as Meshless
+from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters
+from jaxfit._base._method import AbstractBaseMethod as AbstractBaseMethod
+from jaxfit._base._method import Coons as Coons

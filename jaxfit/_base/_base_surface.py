@@ -5,16 +5,22 @@ import operator
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._base._boundary import Boundary, diagonal, middle
+from jaxfit._base._boundary import Boundary, farthest, frame
+from jaxfit._base._cloud import Cloud, cloud_of
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
+from jaxfit._base._douglas_peucker import chord_lengths
+from jaxfit._base._method import AbstractBaseMethod, Coons, refined
 from jaxfit._base._opposite import starts_by_count, starts_by_tolerance
-from jaxfit._checks import as_points, is_concrete
+from jaxfit._checks import as_points, check_kind, is_concrete
 from jaxfit._splines import BSplineSurface
 
 MAX_STEPS = 100  # of the curve fit; few curves use them up
 CLOSE = 0.01  # the curve fit stops when its average error is this much of the tolerance
 FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are split in the middle
+
+POINTS_PER_CONTROL_POINT = 8  # of a net chosen here for a method that looks at the cloud
+MOST_CONTROL_POINTS = 64  # per direction, likewise
 
 
 def base_surface(
@@ -24,42 +30,50 @@ def base_surface(
     order: tuple[int, int] = (4, 4),
     tolerance: float = 5e-3,
     abscissae: AbstractAbscissae = GREVILLE,
+    method: Coons | AbstractBaseMethod | None = None,
 ) -> BSplineSurface:
     """A surface that has the four boundary polylines as its sides: where a fit starts.
 
     Each polyline is reduced to its Douglas-Peucker vertices, which are the first control points
     of a B-spline curve; geometric approximation fits the curve to the polyline; opposite curves
     are brought onto common knots; a bilinear Coons blend of the control points fills the inside
-    (`coons_surface`). The domain is [0, 1] x [0, 1]; the corners are those of the boundary.
+    (`coons_surface`). The domain is [0, 1] x [0, 1]; the corners are those of the boundary. With
+    `method`, the control points inside then move to where the cloud is.
 
     Parameters
     ----------
     boundary : Boundary
         Four polylines in d dimensions, any unit, any number of vertices.
     points : array (N, d), optional
-        The cloud. The Coons surface does not look inside: the cloud serves only to measure
-        the bounding-box diagonal, of which `tolerance` is a fraction.
+        The cloud. The Coons surface does not look inside: for it the cloud serves only to measure
+        the size, of which `tolerance` is a fraction. The other methods need it.
     net : (nu, nv), optional
         Control points along u and v, exactly. Without it each curve takes as many as `tolerance`
         asks for (at least its order, at most 64), and the net is the refinement of opposite
         curves to their common knots, which does not change their shape. Knots of opposite
         curves closer than 0.02 of the domain and half a mean span are made equal before the fit.
+        Methods that look at the cloud then refine it, where it is smaller, to about one control
+        point for every eight points, at most 64 each way.
     order : (K, L)
         Degree + 1 along u and v, each 2 to 8.
     tolerance : float
-        How far from the reduced polyline, as a fraction of the diagonal, Douglas-Peucker may
-        leave a vertex (default 5e-3). The fitted curves are closer on average (0.02 to 0.2 % of
+        How far from the reduced polyline Douglas-Peucker may leave a vertex, as a fraction of the size
+        (default 5e-3): twice the greatest distance of any point from the boundary's centre of gravity,
+        which is the diagonal of a rectangle. The fitted curves are closer on average (0.02 to 0.2 % of
         the diagonal on scans); a rough outline may be rounded off by twice the tolerance. With
         `net` all vertices are spread by deviation and length, and `tolerance` matters little:
         pieces straight to within a fifth of it are split in the middle.
     abscissae : Greville() or Uniform()
         Of the Coons blend; see `coons_surface`.
+    method : Coons(), Meshless() or DynamicBaseSurface(), optional
+        What fills the inside (default `Coons(abscissae)`, right where the patch is close to its
+        boundary's blend). `Meshless()` is the surest for patches that bulge or overhang.
 
     Raises
     ------
     ValueError
         For a net smaller than the order, an order outside 2 to 8, a tolerance that is not
-        positive, points of another dimension.
+        positive, points of another dimension; a method that needs points without them.
     TypeError
         For a boundary traced by `jit`: which vertices are kept depends on their values.
 
@@ -73,19 +87,59 @@ def base_surface(
     Sources: paper sections 2.3 and 4.1, equations (5)-(7), Algorithm 1 for curves.
     """
     order, net = _checked(boundary, net, order, tolerance)
+    check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     sides = [np.asarray(x) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
     dtype, dimension = sides[0].dtype, sides[0].shape[1]
-    cloud = [] if points is None else [np.asarray(as_points("points", points, dimension))]
+    clouds = [] if points is None else [np.asarray(as_points("points", points, dimension))]
+    _check_cloud(method, clouds, points)
     # Centred and of size one, so that neither units nor coordinates in the millions matter.
-    centre, size = middle(*sides), diagonal(*sides)
+    centre, size = frame(sides)
     lines = [(x.astype(float) - centre) / size for x in sides]
-    curves = _curves(lines, net, order, tolerance * diagonal(*sides, *cloud) / size, dtype)
+    reach = 2 * farthest(centre, *sides, *clouds)
+    curves = _curves(lines, net, order, tolerance * reach / size, dtype)
     controls, knots = zip(*curves, strict=True)
-    blend = coons_net(controls, knots[0], knots[2], abscissae)
-    placed = (np.asarray(blend, float) * size + centre).astype(dtype)
+    blend = coons_net(
+        controls, knots[0], knots[2], method.abscissae if isinstance(method, Coons) else abscissae
+    )
+    placed, pair = np.asarray(blend, float), (knots[0], knots[2])
+    if isinstance(method, AbstractBaseMethod):
+        placed, pair = _filled(method, placed, pair, order, net is None, cloud_of(clouds[0], boundary))
+    placed = (placed * size + centre).astype(dtype)
     for j, side in ((0, sides[0]), (-1, sides[1])):  # the corners to the last bit
         placed[0, j], placed[-1, j] = side[0], side[-1]
-    return BSplineSurface(placed, knots[0], knots[2])
+    return BSplineSurface(placed, *(x.astype(dtype) for x in pair))
+
+
+def _filled(
+    method: AbstractBaseMethod,
+    net: np.ndarray,
+    knots: tuple[np.ndarray, np.ndarray],
+    order: tuple[int, int],
+    grows: bool,
+    cloud: Cloud,
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """The net, refined if it `grows`, with its inside at the cloud; and its knots."""
+    pair = [x.astype(float) for x in knots]
+    if grows:
+        lengths = [chord_lengths(x)[-1] for x in cloud.sides]
+        ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
+        root = np.sqrt(len(cloud.points) / POINTS_PER_CONTROL_POINT)
+        for axis, wanted in enumerate((root * ratio, root / ratio)):
+            most = min(round(wanted), MOST_CONTROL_POINTS)
+            net, pair[axis] = refined(net, pair[axis], order[axis], axis, most)
+    return method.fill(net, (pair[0], pair[1]), order, cloud), (pair[0], pair[1])
+
+
+def _check_cloud(method: Coons | AbstractBaseMethod | None, clouds: list, points: ArrayLike | None) -> None:
+    if not isinstance(method, AbstractBaseMethod):
+        return
+    if not clouds:
+        raise ValueError(
+            f"points must be given for {type(method).__name__}(), but is None; pass the cloud or use Coons()."
+        )
+    if not is_concrete(points):
+        raise TypeError("points must be concrete, but are traced; call base_surface outside jit.")
+    method.check_dimension(clouds[0].shape[1])
 
 
 def _curves(

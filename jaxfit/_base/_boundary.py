@@ -82,10 +82,21 @@ def diagonal(*sets: np.ndarray) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def middle(*sets: np.ndarray) -> np.ndarray:
-    """Middle of the bounding box of all the points together."""
-    low, high = _box(sets)
-    return low + (high - low) / 2
+def frame(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    """Centre of gravity of the polylines, and twice the greatest distance from it: the size.
+
+    For a rectangle the size is the diagonal. Unlike the bounding box, both turn with the boundary.
+    """
+    steps = [np.linalg.norm(np.diff(x.astype(float), axis=0), axis=1) for x in sides]
+    halves = [(x[1:].astype(float) - sides[0][0] + x[:-1] - sides[0][0]) / 2 for x in sides]
+    length = np.concatenate(steps)
+    centre = sides[0][0] + length @ np.concatenate(halves) / length.sum()
+    return centre, 2 * farthest(centre, *sides)
+
+
+def farthest(centre: np.ndarray, *sets: np.ndarray) -> float:
+    """Greatest distance of any of the points from the centre."""
+    return max(float(np.linalg.norm(x - centre, axis=1).max()) for x in sets)
 
 
 def _box(sets: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:

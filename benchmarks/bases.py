@@ -1,0 +1,70 @@
+"""Base surfaces of scanned clouds: distance of the cloud from each, and of the fits that start there.
+
+    python benchmarks/bases.py [--data FOLDER] [--max-steps N] [name ...]
+
+Distances are to true closest points, in % of the diagonal of the cloud's bounding box. Fits are Algorithm 1
+with relaxation 1.7. `folds` counts, on a grid of 400 x 400 parameters, the neighbours whose normals
+point opposite ways: where the surface folds over, or turns more sharply than the grid shows.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import helpers
+
+import jaxfit as jf
+
+NETS = {"mannequin_head": (42, 42), "igea_face": (42, 42), "blade_wrap_3000": (24, 40), "mountain": (42, 42)}
+METHODS = {"Coons": jf.Coons(), "dynamic": jf.DynamicBaseSurface(), "meshless": jf.Meshless()}
+
+
+def folds(surface):
+    at = np.linspace(0.0, 1.0, 400)
+    normals = np.asarray(surface.normal(*np.meshgrid(at, at, indexing="ij")))
+    pairs = (normals[1:], normals[:-1]), (normals[:, 1:], normals[:, :-1])
+    return sum(int(np.sum(np.sum(a * b, axis=2) < 0)) for a, b in pairs)
+
+
+def row(name, label, points, boundary, net, max_steps):
+    begun = time.perf_counter()
+    base = jf.base_surface(boundary, points, net, method=METHODS[label])
+    seconds = time.perf_counter() - begun
+    share = 100 / helpers.diagonal(points)
+    distance = share * np.asarray(jf.closest_point(base, points).distance)
+    method = jf.GeometricApproximation(relaxation=1.7)
+    fit = jf.approximate(points, base, method, tol_average=0.0, max_steps=max_steps)
+    print(
+        f"{name:<16}{label:<10}{'{} x {}'.format(*net):>8}{seconds:>7.1f}"
+        f"{distance.mean():>10.4f}{distance.max():>9.3f}{folds(base):>8}"
+        f"{100 * float(fit.average_error):>10.4f}{100 * float(fit.maximum_error):>9.3f}"
+        f"{folds(fit.surface):>8}",
+        flush=True,
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(description="base surfaces of scanned clouds")
+    parser.add_argument("names", nargs="*", default=list(NETS))
+    parser.add_argument("--data", type=Path, default=helpers.FOLDER)
+    parser.add_argument("--max-steps", type=int, default=200)
+    options = parser.parse_args()
+    heads = ("data", "base", "net", "time/s", "average", "maximum", "folds", "fit ave.", "maximum", "folds")
+    print(("{:<16}{:<10}{:>8}{:>7}{:>10}{:>9}{:>8}{:>10}{:>9}{:>8}").format(*heads))
+    for name in options.names:
+        with np.load(options.data / f"{name}.npz") as arrays:
+            points = arrays["points"]
+            boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
+        for label in METHODS:
+            row(name, label, points, boundary, NETS[name], options.max_steps)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""Tensor-product splines by dense matrices on the host: nothing compiles for a new size of grid."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+Knots = tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]]
+
+
+def basis_matrix(
+    knots: Float[Any, " knots"], order: int, u: Float[Any, " points"], derivative: int = 0
+) -> Float[Any, "points n"]:
+    """All basis functions, or their derivatives, at `u`."""
+    from scipy.interpolate import BSpline
+
+    return BSpline(knots, np.eye(len(knots) - order), order - 1)(u, derivative)
+
+
+def greville(knots: Float[Any, " knots"], order: int) -> Float[Any, " n"]:
+    """Means of order - 1 consecutive knots: where interpolation is always possible."""
+    sums = np.cumsum(np.concatenate([[0.0], knots]))
+    places = (sums[order : len(knots)] - sums[1 : len(knots) - order + 1]) / (order - 1)
+    return np.clip(places, knots[0], knots[-1])
+
+
+def applied(
+    first: Float[Any, "a n"], net: Float[Any, "n m d"], second: Float[Any, "b m"]
+) -> Float[Any, "a b d"]:
+    """One matrix along each direction of a net."""
+    return np.swapaxes(np.tensordot(second, np.tensordot(first, net, 1), (1, 1)), 0, 1)
+
+
+class Frame:
+    """Points and normals of the surfaces of one spline space, on one grid of parameters."""
+
+    def __init__(self, knots: Knots, order: tuple[int, int], u: np.ndarray, v: np.ndarray):
+        self._u = [basis_matrix(knots[0], order[0], u, k) for k in (0, 1)]
+        self._v = [basis_matrix(knots[1], order[1], v, k) for k in (0, 1)]
+
+    def points(self, net: Float[Any, "nu nv d"]) -> Float[Any, "a b d"]:
+        """R(u_a, v_b)."""
+        return applied(self._u[0], net, self._v[0])
+
+    def normals(self, net: Float[Any, "nu nv 3"]) -> Float[Any, "a b 3"]:
+        """Unit normals, zero where the surface has none."""
+        along_u = applied(self._u[1], net, self._v[0])
+        cross = np.cross(along_u, applied(self._u[0], net, self._v[1]))
+        length = np.linalg.norm(cross, axis=2, keepdims=True)
+        return cross / np.where(length > 0, length, 1.0)

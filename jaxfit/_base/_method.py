@@ -1,0 +1,54 @@
+"""What fills the inside of a base surface: the choice is an object."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._base._cloud import Cloud
+from jaxfit._base._coons import GREVILLE, AbstractAbscissae
+
+Knots = tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]]
+
+
+class AbstractBaseMethod(eqx.Module):
+    """A way from the Coons surface of a boundary, and a cloud, to a base surface."""
+
+    @abstractmethod
+    def fill(
+        self, net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], cloud: Cloud
+    ) -> Float[Any, "nu nv d"]:
+        """The net with its inside moved towards the cloud, all in the cloud's frame of size one."""
+
+    @abstractmethod
+    def check_dimension(self, dimension: int) -> None:
+        """Raise ValueError where the method cannot work in a space of this dimension."""
+
+
+class Coons(eqx.Module):
+    """The Coons surface of the boundary itself; it does not look at the points.
+
+    `abscissae`: `Greville()` (default) or `Uniform()`, as in `coons_surface`.
+    """
+
+    abscissae: AbstractAbscissae = GREVILLE
+
+
+def refined(
+    net: np.ndarray, knots: np.ndarray, order: int, axis: int, wanted: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Net and knots after halving the widest spans until there are `wanted` control points along an axis.
+
+    Exact: the surface stays.
+    """
+    from scipy.interpolate import BSpline
+
+    curve = BSpline(knots, np.moveaxis(net, axis, 0), order - 1)
+    while len(curve.t) - order < wanted:
+        widths = np.diff(curve.t)
+        widest = int(np.argmax(widths > widths.max() * (1 - 1e-9)))
+        curve = curve.insert_knot((curve.t[widest] + curve.t[widest + 1]) / 2)
+    count = len(curve.t) - order
+    return np.moveaxis(curve.c[:count], 0, axis), curve.t

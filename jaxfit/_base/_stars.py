@@ -1,0 +1,162 @@
+"""Delaunay stars of scattered points, each in its own tangent plane, and mean-value weights on them.
+
+The neighbours of a point p in a planar Delaunay triangulation are the corners of the convex hull of all
+other points inverted at p, q -> (q - p) / |q - p|^2 (circles through p become lines). That hull is found
+for all points at once by dropping, from neighbours sorted by angle, those inside the triangle of p and
+their two neighbours, until none is left: a few passes over arrays (points, width), no triangulation.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._base._normals import frames, oriented
+
+TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
+SPARE = 16  # of which there may be so many
+WIDTH = 4  # times the neighbours asked for: the most that symmetry may add
+COCIRCULAR = 1e-7  # sine of a turn of the hull that still counts as straight on
+STEEP = 3  # powers of the cosine that a step out of the plane is lengthened by
+LEAST = 0.05  # the least such cosine
+WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than this
+
+
+class Stars(NamedTuple):
+    """For every point its star, in order of angle, padded at the end."""
+
+    members: Int[Any, "points width"]  # numbers of the neighbours
+    filled: Bool[Any, "points width"]
+    plane: Float[Any, "points width 2"]  # where they lie around the point, at their true distances
+    angle: Float[Any, "points width"]  # from each to the next, at most 2 pi
+
+
+def stars(points: Float[Any, "points d"], count: int) -> Stars:
+    """The stars among about `count` neighbours, d >= 2; no two points may coincide."""
+    members, filled = neighbourhoods(points, count)
+    plane = _unrolled(points, members, filled)
+    angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
+    order = np.argsort(angle, axis=1, kind="stable")
+    members, filled, plane = _taken((members, filled, plane), order)
+    members, filled, plane = _hulls(members, filled, plane)
+    return Stars(members, filled, plane, _gaps(plane, filled))
+
+
+def neighbourhoods(
+    points: Float[Any, "points d"], count: int
+) -> tuple[Int[Any, "points width"], Bool[Any, "points width"]]:
+    """Numbers of near points, nearest first, and which entries are filled.
+
+    Two points are neighbours if either is among the `count` nearest of the other. The nearest alone all
+    lie on one side where the density changes; made symmetric, they reach into the thin side as well.
+    """
+    from scipy.spatial import cKDTree
+
+    asked = min(count + 1 + SPARE, len(points))
+    distance, near = cKDTree(points).query(points, asked)
+    own = np.arange(len(points))
+    reach = distance[:, min(count, asked - 1)] * (1 + TIES)
+    within = (distance <= reach[:, None]) & (near != own[:, None])
+    i, j = np.repeat(own, within.sum(axis=1)), near[within]
+    far = distance[within]
+    i, j, far = np.concatenate([i, j]), np.concatenate([j, i]), np.concatenate([far, far])
+    pairs, first = np.unique(i * len(points) + j, return_index=True)
+    i, j, far = pairs // len(points), pairs % len(points), far[first]
+    order = np.lexsort((far, i))
+    i, j = i[order], j[order]
+    place = np.arange(len(i)) - np.searchsorted(i, own)[i]
+    kept = place < WIDTH * count
+    width = int(place[kept].max()) + 1
+    members = np.zeros((len(points), width), int)
+    filled = np.zeros((len(points), width), bool)
+    members[i[kept], place[kept]] = j[kept]
+    filled[i[kept], place[kept]] = True
+    return members, filled
+
+
+def _unrolled(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> np.ndarray:
+    """Neighbours in the tangent plane: the direction is projected, the distance kept or lengthened.
+
+    It is divided by the cosine of the slope of the step, `STEEP` times over, and likewise where the normals
+    point away from each other: a point on the sheet below is as near as those beside, and must be
+    farther; on a ridge, where there are no others, it stays a neighbour.
+    """
+    steps = points[members] - points[:, None]
+    far = np.where(filled, np.linalg.norm(steps, axis=2), 1.0)
+    unit = np.where(filled[..., None], steps / far[..., None], 0.0)
+    nearest = np.where(filled, far, np.inf).min(axis=1, keepdims=True)
+    axes = frames(unit, np.where(filled, nearest / far, 0.0))
+    flat = unit @ axes[:, :, -2:]
+    length = np.linalg.norm(flat, axis=2)
+    cosine = np.maximum(length, LEAST)
+    if points.shape[1] == 3:
+        normals = oriented(axes[:, :, 0], unit, members, filled)
+        agree = 1 + np.sum(normals[members] * normals[:, None], axis=2)
+        cosine = cosine * np.clip(agree, LEAST, 1.0)
+    return flat * (far / (np.where(length > 0, length, 1.0) * cosine**STEEP))[..., None]
+
+
+def _taken(arrays: tuple[np.ndarray, ...], order: np.ndarray) -> list[np.ndarray]:
+    """Each row of each array in the order given."""
+    return [np.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), axis=1) for x in arrays]
+
+
+def _hulls(
+    members: np.ndarray, filled: np.ndarray, plane: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Drop the neighbours that are no Delaunay neighbours."""
+    square = np.sum(plane**2, axis=2)
+    flipped = plane / np.where(square > 0, square, 1.0)[..., None]
+    rows = np.arange(len(members))  # those in which something was dropped last time
+    while len(rows):
+        part, there = flipped[rows], filled[rows]
+        before, after = around(part, there)
+        turn = _cross(part - before, after - part)
+        size = np.linalg.norm(part - before, axis=2) * np.linalg.norm(after - part, axis=2)
+        # Across half a turn or more there is no triangle that could hide the point.
+        dropped = there & (_cross(before, after) > 0) & (turn < -COCIRCULAR * size)
+        # A point whose two neighbours are one and the same stays.
+        dropped &= (there.sum(axis=1) > 2)[:, None]
+        changed = dropped.any(axis=1)
+        rows, there = rows[changed], (there & ~dropped)[changed]
+        order = np.argsort(~there, axis=1, kind="stable")
+        parts = _taken((members[rows], there, plane[rows], flipped[rows]), order)
+        members[rows], filled[rows], plane[rows], flipped[rows] = parts
+    width = int(filled.sum(axis=1).max())
+    return members[:, :width], filled[:, :width], plane[:, :width]
+
+
+def around(
+    x: Float[Any, "points width ..."] | Int[Any, "points width"], filled: Bool[Any, "points width"]
+) -> list[Any]:
+    """The entry before and the entry after each, going round; filled entries come first in each row."""
+    count = np.maximum(filled.sum(axis=1), 1)[:, None]
+    place = np.arange(filled.shape[1])[None, :]
+    return [_taken((x,), (place + shift) % count)[0] for shift in (-1, 1)]
+
+
+def _cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
+
+
+def _gaps(plane: np.ndarray, filled: np.ndarray) -> np.ndarray:
+    """Angle from each neighbour to the next; a single neighbour leaves a gap of a full turn."""
+    after = around(plane, filled)[1]
+    angle = np.arctan2(_cross(plane, after), np.sum(plane * after, axis=2))
+    alone = filled.sum(axis=1, keepdims=True) == 1
+    return np.where(filled, np.where(alone, 2 * np.pi, angle % (2 * np.pi)), 0.0)
+
+
+def mean_value_weights(star: Stars) -> Float[Any, "points width"]:
+    r"""Positive weights $(\tan(\alpha_{k-1}/2) + \tan(\alpha_k/2)) / r_k$ of the neighbours, not normalised.
+
+    With $\alpha$ the angles to the neighbours before and after and r the distance, a point in the plane
+    is the mean of its neighbours with them. Gaps count as at most `WIDEST`, so that weights
+    stay positive and do not jump where a gap passes half a turn.
+
+    Source: M. S. Floater, Mean value coordinates, Computer Aided Geometric Design 20 (2003).
+    """
+    half = np.tan(np.minimum(star.angle, WIDEST) / 2)
+    before = around(half[..., None], star.filled)[0][..., 0]
+    far = np.linalg.norm(star.plane, axis=2)
+    return np.where(star.filled, (before + half) / np.where(star.filled, far, 1.0), 0.0)

@@ -1,0 +1,113 @@
+"""Tensor-product least squares with a thin plate, on nets whose border control points are given."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+GROSS = 20.0  # times the median residual: where a point has half its weight
+LEAST = 1e-9  # of the diagonal: a residual this small is rounding
+SPECK = 1e-13  # of the mean diagonal entry
+
+
+def collocation(knots: Float[Any, " knots"], order: int, u: Float[Any, " points"]) -> Any:
+    """Sparse matrix (points, control points) of the basis functions at `u`, within the domain."""
+    from scipy.interpolate import BSpline
+
+    return BSpline.design_matrix(u, knots, order - 1)
+
+
+def tensor_rows(first: Any, second: Any) -> Any:
+    """Row k is the Kronecker product of row k of each: sparse (points, columns x columns)."""
+    from scipy.sparse import csr_array
+
+    first, second = csr_array(first), csr_array(second)
+    count, (k, m) = first.shape[0], (first.indptr[1], second.indptr[1])
+    values = first.data.reshape(count, k, 1) * second.data.reshape(count, 1, m)
+    columns = first.indices.reshape(count, k, 1).astype(int) * second.shape[1]
+    columns = columns + second.indices.reshape(count, 1, m)
+    rows = np.arange(count + 1) * (k * m)
+    shape = (count, first.shape[1] * second.shape[1])
+    return csr_array((values.ravel(), columns.ravel(), rows), shape=shape)
+
+
+def thin_plate(knots: tuple[np.ndarray, np.ndarray], order: tuple[int, int]) -> Any:
+    r"""Sparse matrix of $\int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2$ (10), index i nv + j."""
+    from scipy.sparse import kron
+
+    u, v = (_products(t, k) for t, k in zip(knots, order, strict=True))
+    return (kron(u[2], v[0]) + 2 * kron(u[1], v[1]) + kron(u[0], v[2])).tocsr()
+
+
+def _products(knots: np.ndarray, order: int) -> list[Any]:
+    """Integrals of products of the basis functions, and of their first and second derivatives."""
+    from scipy.interpolate import BSpline
+    from scipy.sparse import csr_array, diags_array
+
+    nodes, weights = np.polynomial.legendre.leggauss(order)  # exact for the degree
+    breaks = np.unique(knots)
+    half, middle = np.diff(breaks) / 2, (breaks[1:] + breaks[:-1]) / 2
+    at = (middle[:, None] + half[:, None] * nodes).ravel()
+    scale = diags_array((half[:, None] * weights).ravel())
+    count = len(knots) - order
+    found = []
+    for derivative in range(3):
+        if derivative >= order:
+            found.append(csr_array((count, count)))
+            continue
+        basis = BSpline(knots, np.eye(count), order - 1)
+        values = csr_array(basis(at, derivative))
+        found.append(values.T @ scale @ values)
+    return found
+
+
+def robust_held_fit(
+    border: Float[Any, "nu nv d"],
+    knots: tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]],
+    order: tuple[int, int],
+    places: Float[Any, "points 2"],
+    points: Float[Any, "points d"],
+    smoothing: float,
+    rounds: int,
+) -> Float[Any, "nu nv d"]:
+    r"""The net that minimises $\sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F$, its border as given.
+
+    F is the thin plate over the unit square; $\lambda$ is `smoothing` times the trace of the first matrix
+    over that of the second. With `smoothing` > 0 there is one solution whatever the points. The weights
+    are 1 at first, and fall with the residual over its median in each of the `rounds`.
+    """
+    parts = [collocation(t, k, x) for t, k, x in zip(knots, order, places.T, strict=True)]
+    rows, plate = tensor_rows(*parts), thin_plate(knots, order)
+    weights = np.ones(len(points))
+    net = _held_solution(border, rows, plate, points, weights, smoothing)
+    for _ in range(rounds):
+        residual = np.linalg.norm(rows @ net.reshape(-1, net.shape[2]) - points, axis=1)
+        usual = max(GROSS * float(np.median(residual)), LEAST)
+        weights = 1 / (1 + (residual / usual) ** 2)
+        net = _held_solution(border, rows, plate, points, weights, smoothing)
+    return net
+
+
+def _held_solution(
+    border: np.ndarray, rows: Any, plate: Any, points: np.ndarray, weights: np.ndarray, smoothing: float
+) -> np.ndarray:
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    nu, nv, d = border.shape
+    inside = np.zeros((nu, nv), bool)
+    inside[1:-1, 1:-1] = True
+    free, held = np.flatnonzero(inside), np.flatnonzero(~inside)
+    if not len(free):
+        return border
+    normal = rows.T @ diags_array(weights) @ rows
+    trace = normal.diagonal().sum()
+    system = (normal + smoothing * trace / plate.diagonal().sum() * plate).tocsr()
+    flat = border.reshape(-1, d).copy()
+    right = (rows.T @ (weights[:, None] * points))[free] - system[free][:, held] @ flat[held]
+    # Where the plate has no bending (order 2) it leaves a control point without points undecided.
+    speck = SPECK * trace / len(flat)
+    inner = system[free][:, free] + speck * diags_array(np.ones(len(free)))
+    factors = splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    flat[free] = factors.solve(right + speck * flat[free])
+    return flat.reshape(nu, nv, d)

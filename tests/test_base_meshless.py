@@ -1,0 +1,183 @@
+"""Meshless parameters keep shapes whatever the density; the base at them is near any cloud."""
+
+import helpers
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+import jaxfit as jf
+from jaxfit._base._stars import mean_value_weights, stars
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+NET = (10, 9)
+
+
+def square(lift=lambda x: x):
+    """Boundary of two vertices a side."""
+    a, b, c, d = lift(SQUARE)
+    return jf.Boundary(np.stack([a, b]), np.stack([d, c]), np.stack([a, d]), np.stack([b, c]))
+
+
+def uneven(count, seed=0):
+    """Points of the unit square, eight times as dense on the left as on the right."""
+    x, y = np.random.default_rng(seed).random((2, count))
+    return np.stack([np.where(x < 8 / 9, x * 9 / 16, 0.5 + (x - 8 / 9) * 4.5), y], axis=1)
+
+
+def bump(count=1500, seed=0):
+    points, edges = helpers.wavy_cloud(count, seed, 0.4)
+    return points, jf.Boundary(**edges)
+
+
+def nets(points, boundary, **options):
+    surface = jf.base_surface(boundary, points, NET, method=jf.Meshless(**options))
+    return np.asarray(surface.control_points)
+
+
+def mean_error(surface, points):
+    """Mean distance over the diagonal."""
+    return helpers.mean_distance(surface, points) / helpers.diagonal(points)
+
+
+def test_stars_are_those_of_the_delaunay_triangulation():
+    points = np.random.default_rng(0).random((800, 2))
+    star = stars(points, 30)
+    first, others = Delaunay(points).vertex_neighbor_vertices
+    inner = np.flatnonzero(np.all(np.abs(points - 0.5) < 0.4, axis=1))
+    for i in inner:
+        assert set(star.members[i][star.filled[i]]) == set(others[first[i] : first[i + 1]])
+    inner = inner[star.angle[inner].max(axis=1) < np.deg2rad(150)]  # where nothing is capped
+    weights = mean_value_weights(star)
+    means = np.sum(weights[..., None] * points[star.members], axis=1) / weights.sum(axis=1)[:, None]
+    np.testing.assert_allclose(means[inner], points[inner], atol=1e-12)
+
+
+def test_a_flat_square_keeps_its_coordinates_at_eight_to_one_density():
+    points = uneven(3000)
+    u, v = jf.meshless_parameters(points, square(), reweightings=0)
+    np.testing.assert_allclose(u, points[:, 0], atol=0.02)
+    np.testing.assert_allclose(v, points[:, 1], atol=0.02)
+
+
+def test_boundary_vertices_and_duplicates_get_what_they_must():
+    points, boundary = bump(300)
+    u0 = np.asarray(boundary.u0)
+    u, v = jf.meshless_parameters(np.concatenate([points, points[:50], u0]), boundary)
+    np.testing.assert_array_equal(u[300:350], u[:50])
+    np.testing.assert_array_equal(u[350:], 0.0)
+    arc = np.cumsum(np.linalg.norm(np.diff(u0, axis=0), axis=1))
+    np.testing.assert_allclose(v[351:], arc / arc[-1], atol=1e-12)
+
+
+def test_an_overhang_is_carried():
+    # A ball cut off below: the height goes up, over and in again, so that sides lie under the top.
+    cut = 0.75
+    points = np.random.default_rng(1).normal(size=(4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = points[points[:, 2] > -np.cos(cut)]
+    turn = np.linspace(0, np.pi / 2, 30)
+    sides = []
+    for start in (-3, -1, 1, 3):
+        angle = start * np.pi / 4 + turn
+        height = np.full(30, -np.cos(cut))
+        sides.append(np.stack([np.sin(cut) * np.cos(angle), np.sin(cut) * np.sin(angle), height], axis=1))
+    boundary = jf.Boundary(v0=sides[0], v1=sides[2][::-1], u0=sides[3][::-1], u1=sides[1])
+    base = jf.base_surface(boundary, points, NET, method=jf.Meshless())
+    assert mean_error(base, points) < 1e-2
+    assert mean_error(jf.base_surface(boundary, net=NET), points) > 0.1
+
+
+def test_the_border_is_that_of_the_coons_surface():
+    points, boundary = bump()
+    net, coons = nets(points, boundary), np.asarray(jf.base_surface(boundary, points, NET).control_points)
+    for edge in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        np.testing.assert_allclose(net[edge], coons[edge], atol=1e-15)
+
+
+def test_without_a_net_it_follows_the_number_of_points():
+    points, boundary = bump(800)
+    surface = jf.base_surface(boundary, points, method=jf.Meshless())
+    assert min(surface.shape) >= 8
+    assert max(surface.shape) <= 20
+    assert mean_error(surface, points) < 2e-3
+
+
+def test_order_of_points_and_place_do_not_matter():
+    points, boundary = bump(600)
+    points = np.concatenate([points, helpers.wavy_grid(12, 12, 0.4).reshape(-1, 3)])  # with ties
+    rng = np.random.default_rng(0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    net = nets(points, boundary)
+    np.testing.assert_allclose(nets(rng.permutation(points), boundary), net, atol=1e-10)
+    moved = jax.tree.map(lambda x: 300 * x @ turn.T + 1e3, boundary)
+    there = (nets(300 * points @ turn.T + 1e3, moved) - 1e3) @ turn / 300
+    np.testing.assert_allclose(there, net, atol=1e-9)
+
+
+def test_coordinates_in_the_millions():
+    points, boundary = bump(400)
+    far = jax.tree.map(lambda x: x + 5e6, boundary)
+    np.testing.assert_allclose(nets(points + 5e6, far) - 5e6, nets(points, boundary), atol=1e-6)
+
+
+def test_gross_outliers_hardly_pull():
+    points, boundary = bump(2000)
+    rng = np.random.default_rng(2)
+    spoilt = points.copy()
+    spoilt[:20] += rng.normal(size=(20, 3))
+    surface = jf.base_surface(boundary, spoilt, NET, method=jf.Meshless())
+    assert mean_error(surface, points[20:]) < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["hole", "outside", "two groups", "on a line", "20", "1", "copies"])
+def test_poor_clouds_give_finite_surfaces_within_reach(kind):
+    points, boundary = bump(600)
+    x, y, _ = points.T
+    poor = {
+        "hole": points[np.hypot(x - 0.5, y - 0.5) > 0.3],
+        "outside": points * [2.0, 1.0, 1.0],
+        "two groups": points[(np.abs(x - 0.3) < 0.05) | (np.abs(x - 0.7) < 0.02)],
+        "on a line": np.linspace([0.1, 0.2, 0.0], [0.9, 0.7, 0.1], 40),
+        "20": points[:20],
+        "1": points[:1],
+        "copies": np.repeat(points[:2], 40, axis=0),
+    }[kind]
+    net = nets(poor, boundary)
+    assert np.isfinite(net).all()
+    assert np.abs(net).max() < 4
+
+
+def test_a_cloud_larger_than_asked_for_is_thinned():
+    points, boundary = bump(3000)
+    surface = jf.base_surface(boundary, points, NET, method=jf.Meshless(most_points=300))
+    assert mean_error(surface, points) < 5e-3
+
+
+def test_a_scanned_head_that_overhangs():
+    arrays = helpers.data("mannequin_head")
+    boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
+    surface = jf.base_surface(boundary, arrays["points"], (42, 42), method=jf.Meshless())
+    assert mean_error(surface, arrays["points"]) < 2e-3
+
+
+def test_what_cannot_be_is_refused():
+    points, boundary = bump(50)
+    with pytest.raises(ValueError, match=r"points must be given for Meshless\(\)"):
+        jf.base_surface(boundary, method=jf.Meshless())
+    with pytest.raises(ValueError, match="neighbours must be a whole number of at least 6"):
+        jf.Meshless(neighbours=3)
+    with pytest.raises(ValueError, match="smoothing must be a number of at least 1e-10"):
+        jf.Meshless(smoothing=0.0)
+    with pytest.raises(ValueError, match="points must have 3 coordinates"):
+        jf.meshless_parameters(points[:, :2], boundary)
+    with pytest.raises(TypeError, match="must be concrete"):
+        jax.jit(lambda x: jf.meshless_parameters(x, boundary))(points)
+
+
+def test_an_object_names_the_coons_surface():
+    _, boundary = bump(10)
+    named = jf.base_surface(boundary, net=NET, method=jf.Coons(jf.Uniform()))
+    given = jf.base_surface(boundary, net=NET, abscissae=jf.Uniform())
+    np.testing.assert_array_equal(named.control_points, given.control_points)
