@@ -15,9 +15,11 @@ from jaxfit._closest import closest_point as closest_point
 from jaxfit._fit import RESULTS as RESULTS
 from jaxfit._fit import Chebyshev as Chebyshev
 from jaxfit._fit import ConstantWeight as ConstantWeight
+from jaxfit._fit import Discrepancy as Discrepancy
 from jaxfit._fit import Fairing as Fairing
 from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GaussNewton as GaussNewton
+from jaxfit._fit import GeneralizedCrossValidation as GeneralizedCrossValidation
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History

@@ -24,7 +24,7 @@ from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, padded_start, unit_of
-from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy
+from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy, with_smoothing
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -104,7 +104,9 @@ def approximate(
     concrete = is_concrete(cloud, base, pulls, start)
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     problem = make_problem(cloud, pulls, axes_of(base, dtype), unit, method.foot_tolerance)
+    rule = None
     if isinstance(method, StandardApproximation):
+        rule = method.smoothing
         method, problem = method.prepared(problem)
     size = problem.target.shape[1]
     net = jnp.asarray(unit.inward(base.control_points), dtype)
@@ -116,6 +118,8 @@ def approximate(
         feet = closest_point(base, cloud)
         u, v = feet.u, feet.v
     u, v = (padded_start(x, size, dtype) for x in (u, v))
+    if isinstance(method, StandardApproximation):
+        problem = with_smoothing(rule, method, problem, net, u, v)
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     carry = begin(net, u, v, max_steps, solves=problem.smoothing is not None)
