@@ -37,6 +37,7 @@ from jaxfit._fit import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit import approximate as approximate
 from jaxfit._fit import fit_points as fit_points
 from jaxfit._fit import interpolate as interpolate
+from jaxfit._normal import curvature_energy as curvature_energy
 from jaxfit._parameters import Centripetal as Centripetal
 from jaxfit._parameters import ChordLength as ChordLength
 from jaxfit._parameters import curve_parameters as curve_parameters
