@@ -19,9 +19,11 @@ from jaxfit._closest import closest_point as closest_point
 from jaxfit._fit import RESULTS as RESULTS
 from jaxfit._fit import Chebyshev as Chebyshev
 from jaxfit._fit import ConstantWeight as ConstantWeight
+from jaxfit._fit import Discrepancy as Discrepancy
 from jaxfit._fit import Fairing as Fairing
 from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GaussNewton as GaussNewton
+from jaxfit._fit import GeneralizedCrossValidation as GeneralizedCrossValidation
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
@@ -40,6 +42,7 @@ from jaxfit._fit import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit import approximate as approximate
 from jaxfit._fit import fit_points as fit_points
 from jaxfit._fit import interpolate as interpolate
+from jaxfit._normal import curvature_energy as curvature_energy
 from jaxfit._parameters import Centripetal as Centripetal
 from jaxfit._parameters import ChordLength as ChordLength
 from jaxfit._parameters import curve_parameters as curve_parameters

@@ -8,6 +8,7 @@ from helpers import count_compilations, eps, wavy_cloud
 from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
+from jaxfit._fit._automatic_smoothing import Candidates
 from jaxfit._fit._least_squares import posed
 from jaxfit._fit._measure import border
 from jaxfit._normal import make_system
@@ -146,3 +147,33 @@ def test_impossible_smoothing_gets_a_sentence(value):
 def test_a_solver_of_another_kind_gets_a_sentence():
     with pytest.raises(TypeError, match="solver must be an object"):
         jf.StandardApproximation(solver="cholesky")
+
+
+def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
+    rng = np.random.default_rng(0)
+    noisy = POINTS + 0.01 * rng.normal(size=POINTS.shape)
+    options = dict(max_steps=2, tol_average=1e-9)
+
+    def error(smoothing):
+        fit = jf.approximate(noisy, base, jf.StandardApproximation(smoothing=smoothing), **options)
+        distance = np.asarray(jf.closest_point(fit.surface, POINTS).distance)
+        return fit, np.sqrt(np.mean(distance**2))
+
+    least = min(error(10.0**k)[1] for k in (-5, -4, -3, -2, -1, 0))
+    fit, reached = error(jf.GeneralizedCrossValidation(rounds=1))
+    assert 1e-4 < float(fit.stats["smoothing"]) < 1
+    assert reached < 1.3 * least
+
+
+def test_the_discrepancy_principle_stops_at_the_noise():
+    smoothing = jnp.asarray([1e-3, 1e-2, 1e-1])
+    found = Candidates(smoothing, jnp.asarray([1.0, 4.0, 16.0]), smoothing, jnp.asarray(400.0))
+    assert abs(float(jf.Discrepancy(noise=0.1).best(found)) - 1e-2) < 1e-6
+    assert abs(float(jf.Discrepancy(noise=1e-9).best(found)) - 1e-3) < 1e-6
+
+
+def test_impossible_rules_get_a_sentence():
+    with pytest.raises(ValueError, match="noise must be"):
+        jf.Discrepancy(noise=-1.0)
+    with pytest.raises(ValueError, match="candidates must be"):
+        jf.GeneralizedCrossValidation(candidates=2)

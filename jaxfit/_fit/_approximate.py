@@ -25,7 +25,7 @@ from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
 from jaxfit._fit._loop import Carry, Limits, begin, run
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
-from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy
+from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy, with_smoothing
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -106,7 +106,9 @@ def approximate(
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
+    rule = None
     if isinstance(method, StandardApproximation):
+        rule = method.smoothing
         method, problem = method.prepared(problem)
     size = problem.target.shape[1]
     begun = net = jnp.asarray(unit.inward(base.control_points), dtype)
@@ -122,6 +124,8 @@ def approximate(
         feet = closest_point(base, cloud)
         u, v = feet.u, feet.v
     u, v = (padded_start(x, size, dtype) for x in (u, v))
+    if isinstance(method, StandardApproximation):
+        problem = with_smoothing(rule, method, problem, begun, u, v)
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     together = order_by_cell(axes, u, v, cloud.shape[0])

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import Bool
 
 from jaxfit._cells import values_at
 from jaxfit._checks import check_kind, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
+from jaxfit._fit._automatic_smoothing import AbstractSmoothing, chosen
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
@@ -33,8 +35,9 @@ class StandardApproximation(AbstractIterativeMethod):
 
     Parameters
     ----------
-    smoothing : float
-        lambda (default 2e-5, the paper's for two of its three models); 0 for none. May be traced.
+    smoothing : float, GeneralizedCrossValidation() or Discrepancy(noise)
+        lambda (default 2e-5, the paper's for two of its three models); 0 for none. May be traced. An object
+        chooses it from the data before the iteration begins.
     parameter_correction : bool
         False solves once, at the parameters given as `start` or found on the base surface. The loop then
         measures errors at these parameters; the errors of the fit are at true closest points nevertheless.
@@ -79,7 +82,7 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def __check_init__(self) -> None:
         check_kind("solver", self.solver, AbstractLeastSquares, "GaussNewton()")
-        if not is_concrete(self.smoothing):
+        if isinstance(self.smoothing, AbstractSmoothing) or not is_concrete(self.smoothing):
             return
         value = np.asarray(self.smoothing, np.float64)
         if value.ndim or not 0 <= value < np.inf:
@@ -89,17 +92,27 @@ class StandardApproximation(AbstractIterativeMethod):
             )
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
-        """With lambda moved into the problem, so that another one compiles nothing."""
+        """With lambda moved into the problem, so that another one compiles nothing; 0 until it is chosen."""
+        if isinstance(self.smoothing, AbstractSmoothing):
+            return eqx.tree_at(lambda m: m.smoothing, self, 0.0).prepared(problem)
         xp: Any = np if is_concrete(self.smoothing) else jnp
         smoothing = xp.asarray(self.smoothing, problem.target.dtype)
         problem = eqx.tree_at(lambda p: p.smoothing, problem, smoothing, is_leaf=lambda x: x is None)
         return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem
 
+    def held(self, axes: tuple[Axis, Axis], net: Array) -> Bool[Array, "nu nv"]:
+        """Which control points stay."""
+        return border_on(axes, net.shape, corners_only=not self.fixed_boundary)
+
+    def system(self, problem: Any, pieces: Pieces, measured: Measured) -> System:
+        """The least-squares problem at the present parameters."""
+        u, v = measured.u, measured.v
+        return make_system(pieces, u, v, problem.target, problem.weight, problem.smoothing)
+
     def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
         """The net of least squares at the present parameters."""
-        axes = (pieces.axis_u, pieces.axis_v)
-        held = border_on(axes, turn.net.shape, corners_only=not self.fixed_boundary)
-        net, shift = self.solver(posed(system_at(problem, pieces, measured.u, measured.v), held, turn.net))
+        held = self.held((pieces.axis_u, pieces.axis_v), turn.net)
+        net, shift = self.solver(posed(self.system(problem, pieces, measured), held, turn.net))
         before: Any = turn.shift
         step, growth = turn.step + 1, turn.growth
         if self.insertion is not None and growth is not None:
@@ -122,9 +135,13 @@ class StandardApproximation(AbstractIterativeMethod):
         return Measured(measured.u, measured.v, distance, measured.steps, ~jnp.asarray(idle), active)
 
 
-def system_at(problem: Any, pieces: Pieces, u: Array, v: Array) -> System:
-    """The least-squares problem of a fit at given parameters."""
-    return make_system(pieces, u, v, problem.target, problem.weight, problem.smoothing)
+def with_smoothing(
+    rule: Any, method: StandardApproximation, problem: Any, net: Array, u: Array, v: Array
+) -> Any:
+    """The problem with the lambda that a rule chooses; as it is where lambda was given as a number."""
+    if not isinstance(rule, AbstractSmoothing):
+        return problem
+    return eqx.tree_at(lambda p: p.smoothing, problem, chosen(rule, method, problem, net, u, v))
 
 
 @jax.jit
