@@ -68,11 +68,6 @@ def check_finite(name: str, x: ArrayLike) -> None:
     """Raise unless every entry of the concrete array `x` is finite."""
     values = np.asarray(x)
     if np.isfinite(values).all():
-        if values.dtype.itemsize >= 8 and max(values.max(), -values.min()) > LARGEST:
-            raise ValueError(
-                f"{name} must be at most {LARGEST:g} in magnitude, so that squares stay within the range of "
-                "float64; scale it down."
-            )
         return
     bad = ~np.isfinite(values)
     first = tuple(int(i) for i in np.argwhere(bad)[0])
@@ -81,6 +76,16 @@ def check_finite(name: str, x: ArrayLike) -> None:
         f"{name} must be finite, but {int(bad.sum())} of its {values.size} entries are NaN or "
         f"infinite, the first at index {where}; remove or repair them."
     )
+
+
+def check_magnitude(name: str, x: ArrayLike) -> None:
+    """Raise unless squares of the concrete array `x` stay within the range of float64."""
+    values = np.asarray(x)
+    if values.size and values.dtype.itemsize >= 8 and max(values.max(), -values.min()) > LARGEST:
+        raise ValueError(
+            f"{name} must be at most {LARGEST:g} in magnitude, so that squares stay within the range of "
+            "float64; scale it down."
+        )
 
 
 def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int = 1) -> Any:
@@ -96,6 +101,8 @@ def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int 
             f"{name} must hold at least {least} point{'s' * (least != 1)}, but has shape "
             f"{array.shape}; give more points."
         )
+    if is_concrete(array):
+        check_magnitude(name, array)
     return array
 
 

@@ -15,6 +15,7 @@ import jax
 
 import jaxfit
 from jaxfit import io
+from jaxfit._checks import check_magnitude
 from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_report import print_table, progress_bar
 
@@ -123,6 +124,7 @@ def _read(args: argparse.Namespace) -> io.PointData:
             args.net = _TERRAIN_NET
     else:
         data = io.read_points(args.input)
+        check_magnitude("points", data.cloud)
     return data if args.grid is None else data.as_grid(*args.grid)
 
 
