@@ -24,12 +24,10 @@ def project(
     idle: Bool[Array, " points"] | None = None,
     borders: bool = True,
     within: Border | None = None,
-    together: bool = False,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
     they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
-    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else. `together`:
-    points come in an order in which those of one cell stand together, or nearly so.
+    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -46,10 +44,9 @@ def project(
     if idle is not None:
         feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
     if within is not None:
-        return settle(method, pieces, target, feet, within, limits, together)
+        return settle(method, pieces, target, feet, within, limits)
     if not borders:
-        everywhere = _border(pieces, jnp.asarray(EVERYWHERE))
-        return settle(method, pieces, target, feet, everywhere, limits, together)
+        return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
     return _in_stages(method, pieces, target, feet, limits)
 
 

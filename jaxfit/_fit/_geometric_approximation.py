@@ -120,9 +120,7 @@ class GeometricApproximation(AbstractIterativeMethod):
 
         def converged(measured: Measured) -> Measured:
             # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
-            return measure_feet(
-                self.foot_method, problem, pieces, measured, idle, borders=False, together=True
-            )
+            return measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
 
         bare = eqx.tree_at(lambda m: (m.active, m.pulls), measured, (None, None))
         here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)

@@ -22,11 +22,10 @@ def measure_feet(
     idle: Bool[Any, " points"],
     borders: bool,
     within: Border | None = None,
-    together: bool = False,
 ) -> Measured:
     """Feet from the last ones, converged on the surface, and the errors there; `idle` points have none.
 
-    `borders`, `within` and `together` are those of `project`.
+    `borders` and `within` are those of `project`.
     """
     feet = project(
         method,
@@ -39,7 +38,6 @@ def measure_feet(
         jnp.asarray(idle),
         borders,
         within,
-        together,
     )
     error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
     return Measured(feet.best_u, feet.best_v, error, feet.steps, feet.converged)

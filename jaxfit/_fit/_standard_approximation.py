@@ -126,9 +126,7 @@ class StandardApproximation(AbstractIterativeMethod):
         idle = problem.padding <= 0
         active = jnp.sum(problem.weight > 0, dtype=jnp.int32)
         if self.parameter_correction:
-            feet = measure_feet(
-                self.foot_method, problem, pieces, measured, idle, borders=False, together=True
-            )
+            feet = measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
             return eqx.tree_at(lambda m: m.active, feet, active, is_leaf=lambda x: x is None)
         error = values_at(pieces, measured.u, measured.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
