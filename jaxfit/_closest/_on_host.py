@@ -142,14 +142,22 @@ def padded(x: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([x, np.repeat(x[..., -1:], filling, axis=-1)], axis=-1)
 
 
-def globally(feet_from: Any, samples: Samples | None, points: np.ndarray, size: int) -> HostFeet:
+def globally(
+    feet_from: Any,
+    samples: Samples | None,
+    points: np.ndarray,
+    size: int,
+    known: HostFeet | None = None,
+) -> HostFeet:
     """The nearest foot of all: from the nearest sample, then from every rival that is left.
 
-    `feet_from(which, u, v)` gives the feet of some points (None: all) from starts, at most `size` at a time.
+    `feet_from(which, u, v)` gives the feet of some points (None: all) from starts, at most `size` at a time;
+    `known` feet take the place of those from the nearest samples.
     """
     assert samples is not None
     search = Search(samples, points)
-    best = {name: np.array(x) for name, x in feet_from(None, *search.nearest()).items()}
+    begun = feet_from(None, *search.nearest()) if known is None else known
+    best = {name: np.array(x) for name, x in begun.items()}
     rivals = search.rivals(best["u"], best["v"], np.sqrt(best["f"].astype(np.float64)))
     which, u, v = rivals.first()
     if which.size:

@@ -173,7 +173,9 @@ def _parts(
         return tuple(x[back] for x in parts)
     place = np.argsort(order)[:count]
     u, v, distances, found = (np.asarray(x)[place] for x in parts)
-    best = global_feet(_projector(method), problem, carry.net, carry.growth, count, max_steps)
+    projector = _projector(method)
+    known = (u, v, distances * float(problem.diagonal), found) if projector is method else None
+    best = global_feet(projector, problem, carry.net, carry.growth, count, max_steps, known)
     distance = best[2] / float(problem.diagonal)
     nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):

@@ -27,8 +27,11 @@ def global_feet(
     growth: Growth | None,
     count: int,
     max_steps: int,
+    known: Feet | None = None,
 ) -> Feet:
-    """(u, v, distance, found) of the first `count` points, in the problem's unit."""
+    """(u, v, distance, found) of the first `count` points, in the problem's unit; perhaps nearer than the
+    `known` ones.
+    """
     if growth is None:
         prepared = prepare(net, problem.axis_u, problem.axis_v, sampled=True)
     else:  # nothing is to be sampled behind the last control point in use
@@ -56,5 +59,9 @@ def global_feet(
         return feet
 
     centred = points.T.astype(np.float64) - prepared.centre[None, :]
-    best = globally(feet_from, prepared.samples, centred, size)
+    feet = None
+    if known is not None and known[3].all():
+        parts = dict(zip(("u", "v", "error", "converged"), known, strict=True))
+        feet = parts | dict(f=parts.pop("error") ** 2, steps=np.zeros(count, np.int32))
+    best = globally(feet_from, prepared.samples, centred, size, feet)
     return best["u"], best["v"], np.sqrt(best["f"]), best["converged"]
