@@ -70,7 +70,7 @@ def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], thr
         "parameter_change": solution.parameter_change,
     }
     surface = BSplineSurface(net, *solution.knots)
-    loss = lax.stop_gradient(unit.loss(np.asarray(net) if concrete else net))
+    loss = unit.loss(np.asarray(net)) if concrete else lax.stop_gradient(unit.loss(net))
     fields = (solution.errors, solution.average, solution.maximum)
     errors = [(np.asarray(x) if concrete else x) + loss for x in fields]
     result = _ending(errors[2], loss, account.step, limits, net, throw)
