@@ -4,6 +4,8 @@ A step that increases the distance (beyond rounding) is halved back towards the 
 accepted distances never increase. A bound is active where the gradient points out of it.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
@@ -88,6 +90,10 @@ class Feet(eqx.Module):
         """GOING, ARRIVED at a foot to the tolerance, or GIVEN_UP."""
         return self.whole[2]
 
+    def apart(self) -> "Apart":
+        """The same, one array each."""
+        return Apart(*self.real, *self.whole)
+
     @property
     def converged(self) -> Bool[Array, "*shape"]:
         """Whether the foot has been found to the tolerance."""
@@ -96,6 +102,19 @@ class Feet(eqx.Module):
     def standing(self, state: Int[Array, "*shape"]) -> "Feet":
         """The same feet in another state."""
         return Feet(self.real, jnp.concatenate([self.whole[:2], state[None].astype(jnp.int32)]))
+
+
+class Apart(NamedTuple):
+    """Feet as eight arrays, while they move: computing into a stack is slow, copying into one is not."""
+
+    u: Float[Array, "*shape"]
+    v: Float[Array, "*shape"]
+    best_u: Float[Array, "*shape"]
+    best_v: Float[Array, "*shape"]
+    best: Float[Array, "*shape"]
+    halvings: Int[Array, "*shape"]
+    steps: Int[Array, "*shape"]
+    state: Int[Array, "*shape"]
 
 
 class Box(eqx.Module):
@@ -137,26 +156,25 @@ def new_feet(u: Float[Array, "*shape"], v: Float[Array, "*shape"]) -> Feet:
     return Feet.of(u, v, u, v, jnp.full_like(u, jnp.inf), zero, zero, zero)
 
 
-def is_going(feet: Feet, limits: Limits) -> Bool[Array, "*shape"]:
+def is_going(feet: Feet | Apart, limits: Limits) -> Bool[Array, "*shape"]:
     """Which feet are to be moved on."""
     return (feet.state == GOING) & (feet.steps < limits.steps)
 
 
 def advance(
     method: AbstractFootMethod,
-    feet: Feet,
+    feet: Apart,
     target: Float[Array, "d *shape"],
     coefficients: Float[Array, "d K L ..."],
     box: Box,
     limits: Limits,
-) -> Feet:
+) -> Apart:
     """Evaluate every trial, accept or halve it, and propose the next one.
 
     A trial outside the cell whose polynomial is at hand waits until it is laid out with its own.
     """
     always = limits.tolerance < jnp.inf
-    u, v, best_u, best_v, best = feet.real
-    halvings, steps, _ = feet.whole
+    u, v, best_u, best_v, best, halvings, steps, _ = feet
     first = _measure_at(method, always, u, v, target, coefficients, box)
     next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, steps > PATIENCE, box, limits)
     # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
@@ -174,17 +192,18 @@ def advance(
     returns = judged & ~accepted
     leaps = taken & certain
     here_u, here_v, here = (jnp.where(leaps, x, y) for x, y in ((next_u, u), (next_v, v), (after, first.f)))
-    real = [
+    counted = jnp.where(taken, 0, jnp.where(returns, halvings + 1, halvings))
+    state = jnp.where(leaps, ARRIVED, jnp.where(returns & spent, GIVEN_UP, feet.state))
+    return Apart(
         jnp.where(taken, next_u, jnp.where(returns, back_u, u)),
         jnp.where(taken, next_v, jnp.where(returns, back_v, v)),
         jnp.where(taken, here_u, best_u),
         jnp.where(taken, here_v, best_v),
         jnp.where(taken, here, best),
-    ]
-    counted = jnp.where(taken, 0, jnp.where(returns, halvings + 1, halvings))
-    state = jnp.where(leaps, ARRIVED, jnp.where(returns & spent, GIVEN_UP, feet.state))
-    numbers = [counted, steps + judged, state]
-    return Feet(jnp.stack(real), jnp.stack([x.astype(jnp.int32) for x in numbers]))
+        counted.astype(jnp.int32),
+        (steps + judged).astype(jnp.int32),
+        state.astype(jnp.int32),
+    )
 
 
 def _measure_at(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxfit._cells import Rows, make_rows, make_single_rows, row_width
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
-from jaxfit._closest._feet import ARRIVED, Box, Feet, Limits, advance, is_going
+from jaxfit._closest._feet import ARRIVED, Apart, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._splines._pieces import Axis, Pieces
 
@@ -90,13 +90,14 @@ def _pass(
         mine = Feet(part.spread(feet.real), part.spread(feet.whole))
         mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
 
-        def unfinished(carry: tuple[Array, Feet]) -> Array:
+        def unfinished(carry: tuple[Array, Apart]) -> Array:
             return (carry[0] < steps) & jnp.any(is_going(carry[1], limits))
 
-        def step(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
+        def step(carry: tuple[Array, Apart]) -> tuple[Array, Apart]:
             return carry[0] + 1, advance(method, carry[1], goal, coefficients, box, limits)
 
-        mine = lax.while_loop(unfinished, step, (jnp.asarray(0, jnp.int32), mine))[1]
+        moved = lax.while_loop(unfinished, step, (jnp.asarray(0, jnp.int32), mine.apart()))[1]
+        mine = Feet.of(*moved)
         real = feet.real.at[:, part.point].set(mine.real, mode="drop")
         whole = feet.whole.at[:, part.point].set(mine.whole, mode="drop")
         return start + size, Feet(real, whole)
