@@ -27,27 +27,24 @@ def follow(
     first = staged(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
     pinned_s, pinned_t, settled = pins(first, u, v, box, tolerance)
     ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
-    return staged(always, _landed, first, e, jet, u, v, ds, dt, settled, box)
+    ds, dt = staged(always, _shortened, first, u, v, ds, dt, settled, box)
+
+    def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
+        next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
+        return next_u, landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+
+    next_u, next_v = staged(always, landed, u, v, ds, dt)
+    return next_u, next_v, e - ds[None] * jet.s - dt[None] * jet.t
 
 
-def _landed(
-    first: Forms,
-    e: Array,
-    jet: Jet,
-    u: Array,
-    v: Array,
-    ds: Array,
-    dt: Array,
-    settled: Array,
-    box: Box,
-) -> tuple[Array, Array, Array]:
+def _shortened(
+    first: Forms, u: Array, v: Array, ds: Array, dt: Array, settled: Array, box: Box
+) -> tuple[Array, Array]:
+    """The step within its bounds, and no longer than it does any good."""
     ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)
     ds, dt = within(box, u, v, ds, dt)
     along = first.gradient_s * ds + first.gradient_t * dt
     length2 = first.E * ds * ds + 2.0 * first.F * ds * dt + first.G * dt * dt
     shortest = jnp.maximum(along, 0.0) / jnp.where(length2 > 0, length2, 1.0)
     share = jnp.where(settled, 0.0, jnp.where(2.0 * along >= length2, 1.0, shortest))
-    ds, dt = share * ds, share * dt
-    next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
-    next_v = landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
-    return next_u, next_v, e - ds[None] * jet.s - dt[None] * jet.t
+    return share * ds, share * dt

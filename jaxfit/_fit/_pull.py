@@ -76,13 +76,21 @@ def pull(
         fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
         filled = part.filled & fresh[:, None]
         here = part.spread(jnp.concatenate([problem.target, jnp.stack([u, v, problem.weight])]))
-        (next_u, next_v, e), (s, t) = _step(problem, pieces, part, here, method)
-        error = jnp.sqrt(sum(x * x for x in e))
-        weight = jnp.where(filled, weigh(here[-1], error), 0.0)
-        values = jnp.concatenate([weight[None] * e, weight[None]])
+        next_u, next_v, e = _step(problem, pieces, part, here, method)
+        always = problem.diagonal > 0
+        error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), e)
+
+        def summands(u: Array, v: Array, e: Array, error: Array) -> tuple[Array, Array, Array]:
+            s, t = local_coordinates(pieces, part.cell[:, None], u, v)
+            weight = jnp.where(filled, weigh(here[-1], error), 0.0)
+            # A foot that leaves its cell pulls from the cell's edge this once.
+            values = jnp.concatenate([weight[None] * e, weight[None]])
+            return jnp.clip(s, -1.0, 1.0), jnp.clip(t, -1.0, 1.0), values
+
+        s, t, values = staged(always, summands, next_u, next_v, e, error)
         moments = row_moments(s, t, values, order_u, order_v)
         feet = done.feet.at[:, part.point].set(jnp.stack([next_u, next_v, error]), mode="drop")
-        active = done.active + jnp.sum(weight > 0, dtype=jnp.int32)
+        active = done.active + jnp.sum(values[-1] > 0, dtype=jnp.int32)
         return start + size, _Pass(feet, done.cells.at[part.cell].add(moments), active)
 
     begin = _Pass(
@@ -98,21 +106,18 @@ def pull(
 
 def _step(
     problem: Any, pieces: Pieces, part: Rows, here: Array, method: AbstractFootMethod | None
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
-    """Feet and residuals after a step, or as they are, and the local coordinates at which to sum."""
+) -> tuple[Array, Array, Array]:
+    """Feet and residuals after a step, or as they are."""
     always = problem.diagonal > 0
     target, u, v = here[:-3], here[-3], here[-2]
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
     coefficients = row_coefficients(pieces, part)
     if method is None:
         e = staged(always, lambda *x: target - evaluate_values(*x), coefficients, s, t)
-        return (u, v, e), (s, t)
+        return u, v, e
     jet = staged(always, evaluate_jet, coefficients, s, t)
     axes = (pieces.axis_u, pieces.axis_v)
     box = box_of(pieces, part.cell, [x for a in axes for x in (a.breaks[0], a.breaks[-1])])
     tolerance = problem.foot_tolerance * problem.diagonal
 
-    u, v, e = follow(method, target - jet.value, jet, u, v, box, tolerance)
-    # A foot that leaves its cell pulls from the cell's edge this once.
-    s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    return (u, v, e), (jnp.clip(s, -1.0, 1.0), jnp.clip(t, -1.0, 1.0))
+    return follow(method, target - jet.value, jet, u, v, box, tolerance)
