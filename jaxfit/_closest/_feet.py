@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import evaluate_jet, staged
-from jaxfit._closest._steps import AbstractFootMethod, Forms, Newton, measure
+from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 2.0  # in local coordinates: a cell
@@ -239,10 +239,7 @@ def _next_trial(
     """
     always = limits.tolerance < jnp.inf
     pinned_s, pinned_t, settled = pins(first, u, v, box, limits.tolerance)
-    ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
-    if not method.quadratic:
-        newton_s, newton_t = staged(always, Newton().step, first, pinned_s, pinned_t)
-        ds, dt = jnp.where(late, newton_s, ds), jnp.where(late, newton_t, dt)
+    ds, dt = method.step(first, pinned_s, pinned_t, late, always)
     ds, dt = staged(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
     return staged(always, _foresee, first, u, v, ds, dt, best, box, limits)
 

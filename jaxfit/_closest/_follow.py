@@ -26,7 +26,7 @@ def follow(
     always = tolerance < jnp.inf
     first = staged(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
     pinned_s, pinned_t, settled = pins(first, u, v, box, tolerance)
-    ds, dt = staged(always, method.step, first, pinned_s, pinned_t)
+    ds, dt = method.step(first, pinned_s, pinned_t, settled, always)
     ds, dt = staged(always, _shortened, first, u, v, ds, dt, settled, box)
 
     def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet
+from jaxfit._cells import Jet, staged
 
 # What a lifted eigenvalue of the Hessian, against the first form, is at least.
 LEAST_EIGENVALUE = 1e-3
@@ -68,8 +68,13 @@ class AbstractFootMethod(eqx.Module):
     quadratic: AbstractClassVar[bool]  # whether steps shrink quadratically at a foot
 
     @abstractmethod
-    def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
-        """The step in local coordinates; a pinned coordinate does not move."""
+    def step(
+        self, first: Forms, pinned_s: Array, pinned_t: Array, late: Array, always: Array
+    ) -> tuple[Array, Array]:
+        """The step in local coordinates; a pinned coordinate does not move.
+
+        Where it is `late`, a method that converges linearly takes Newton's step; `always` is for `staged`.
+        """
 
 
 class Newton(AbstractFootMethod):
@@ -82,8 +87,13 @@ class Newton(AbstractFootMethod):
     drift: ClassVar[bool] = False
     quadratic: ClassVar[bool] = True
 
-    def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
+    def step(
+        self, first: Forms, pinned_s: Array, pinned_t: Array, late: Array, always: Array
+    ) -> tuple[Array, Array]:
         """Solve the 2x2 system with the Hessian, made positive where it is not."""
+        return staged(always, self._step, first, pinned_s, pinned_t)
+
+    def _step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
         E, F, G = first.E, first.F, first.G
         a, b, c = E - first.e_ss, F - first.e_st, G - first.e_tt
         # Its eigenvalues against the first form are 1 - curvature * distance; lift a negative one.
@@ -113,9 +123,18 @@ class HuWallner(AbstractFootMethod):
     drift: ClassVar[bool] = True
     quadratic: ClassVar[bool] = False
 
-    def step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
+    def step(
+        self, first: Forms, pinned_s: Array, pinned_t: Array, late: Array, always: Array
+    ) -> tuple[Array, Array]:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""
-        ds, dt = _solve(first, first.E, first.F, first.G, pinned_s, pinned_t)
+        newton_s, newton_t = Newton().step(first, pinned_s, pinned_t, late, always)
+        ds, dt = staged(always, _tangent_plane, first, pinned_s, pinned_t)
+        factor, trusted = staged(always, self._factor, first, ds, dt)
+        circle = trusted & ~late
+        return jnp.where(circle, factor * ds, newton_s), jnp.where(circle, factor * dt, newton_t)
+
+    def _factor(self, first: Forms, ds: Array, dt: Array) -> tuple[Array, Array]:
+        """What the tangent-plane step is multiplied by, and where that can be trusted."""
         ss, st, tt = ds * ds, 2.0 * ds * dt, dt * dt  # second derivative along (ds, dt)
         length2 = ss * first.E + st * first.F + tt * first.G
         height2 = first.f - 2.0 * (ds * first.gradient_s + dt * first.gradient_t) + length2
@@ -131,9 +150,11 @@ class HuWallner(AbstractFootMethod):
         # The section advances by x + (along / length2) x^2 / 2 in its tangent's direction.
         factor = shrink * (1.0 - 0.5 * _divide(along, length2) * shrink)
         # Near the centre of curvature the circle's foot jumps, and the direction is no longer right.
-        trusted = bend <= TRUSTED_SHARE
-        newton_s, newton_t = Newton().step(first, pinned_s, pinned_t)
-        return jnp.where(trusted, factor * ds, newton_s), jnp.where(trusted, factor * dt, newton_t)
+        return factor, bend <= TRUSTED_SHARE
+
+
+def _tangent_plane(first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
+    return _solve(first, first.E, first.F, first.G, pinned_s, pinned_t)
 
 
 def _solve(
