@@ -104,3 +104,19 @@ def test_the_papers_setting_is_at_hand():
     assert method.insertion == jf.KnotInsertion(every=40)
     with pytest.raises(ValueError, match="every must be"):
         jf.KnotInsertion(every=0)
+
+
+def test_local_mode_meets_the_tolerance_and_leaves_the_rest_to_the_bit():
+    base = jf.base_surface(jf.Boundary(**EDGES), net=(12, 12))
+    points = np.asarray(base(*np.random.default_rng(1).random((2, 500))))
+    bump = np.exp(-60 * ((points[:, :2] - 0.7) ** 2).sum(axis=1))
+    points = points + 0.05 * bump[:, None] * np.array([[0.0, 0.0, 1.0]])
+    ends = []
+    for local in (False, True):
+        method = jf.GeometricApproximation(local=local)
+        ends.append(jf.approximate(points, base, method, tol_average=None, tol_maximum=4e-3, max_steps=300))
+    assert all(bool(fit.converged) for fit in ends)
+    same = [np.asarray(x.surface.control_points == base.control_points).all(axis=2) for x in ends]
+    assert same[1].sum() > same[0].sum()
+    active = np.asarray(ends[1].history.active)
+    assert active[0] == 500 > active[1:-1].max()

@@ -1,6 +1,5 @@
 """Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
 
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,7 +11,8 @@ from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border_on, measure_feet
-from jaxfit._fit._pull import pull
+from jaxfit._fit._pull import Pulls, pull
+from jaxfit._fit._region import region_of
 from jaxfit._splines._pieces import Pieces
 
 
@@ -45,8 +45,9 @@ class GeometricApproximation(AbstractIterativeMethod):
     fairing : Fairing(), optional
         Laplacian fairing of the net every few iterations (section 4.3); none by default.
     local : bool, default False
-        Let only those points pull whose error exceeds the tolerance on the maximum error, or on the average
-        error where there is none; control points they do not touch stay (section 4.1).
+        Go on only where the error exceeds the tolerance on the maximum error, or on the average error where
+        there is none (section 4.1): control points move that have influence on a point which has been so far
+        away, now or before; the others stay to the last bit, and points that do not feel the move rest.
     foot_method : Newton() or HuWallner()
         How feet are brought up to date (default Newton).
     foot_tolerance : float
@@ -85,6 +86,11 @@ class GeometricApproximation(AbstractIterativeMethod):
         """Whether feet between the first surface and the last need not have converged."""
         return self.foresee
 
+    @property
+    def marks(self) -> bool:
+        """Whether points that are too far away are remembered."""
+        return self.local
+
     def __check_init__(self) -> None:
         if not 0 < self.relaxation < 2:
             raise ValueError(
@@ -117,25 +123,38 @@ class GeometricApproximation(AbstractIterativeMethod):
     ) -> Measured:
         """Feet from the last ones, converged on the new surface or one step on, and how they pull."""
         idle = problem.padding <= 0
+        resting = idle
+        if self.local:
+            assert measured.poor is not None
+            before = region_of(pieces, measured.u, measured.v, measured.poor)
+            resting = idle | (~before.alive & ~exact)
 
         def converged(measured: Measured) -> Measured:
             # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
-            return measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
+            feet = measure_feet(self.foot_method, problem, pieces, measured, resting, borders=False)
+            return eqx.tree_at(lambda m: m.error, feet, jnp.where(resting, measured.error, feet.error))
 
-        bare = eqx.tree_at(lambda m: (m.active, m.pulls), measured, (None, None))
+        bare = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
         here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
         follower = self.foot_method if self.foresees else None
-        weigh = partial(self._weigh, problem, limits)
-        feet, pulls, active = pull(problem, pieces, here.u, here.v, idle, weigh, follower)
+        feet, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, _all, follower)
         if self.foresees:
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
             steps = jnp.where(exact, here.steps, 1)
             here = Measured(u, v, error, steps, here.found)
-        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls)
+        poor = None
+        if self.local:
+            poor = measured.poor | (~idle & (here.error > self._threshold(limits) * problem.diagonal))
+            # Sums are complete where all points were looked at, or those that feel what was touched before.
+            after = region_of(pieces, here.u, here.v, poor)
+            touched = jnp.where(exact, after.touched, before.touched)
+            pulls = Pulls(jnp.where(touched[..., None], pulls.sums, 0.0))
+        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor)
 
-    def _weigh(self, problem: Any, limits: Limits, weight: Array, error: Array) -> Array:
-        """How much points with these errors pull."""
-        if not self.local:
-            return weight
-        threshold = jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
-        return jnp.where(error > threshold * problem.diagonal, weight, 0.0)
+    def _threshold(self, limits: Limits) -> Array:
+        """The error beyond which a point is poor."""
+        return jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
+
+
+def _all(weight: Array, error: Array) -> Array:
+    return weight

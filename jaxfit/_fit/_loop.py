@@ -39,6 +39,7 @@ class Measured(eqx.Module):
     found: Bool[Any, " points"]
     active: Int[Any, ""] | None = None  # points of a cloud that play a part
     pulls: Pulls | None = None  # of methods that gather them while they measure
+    poor: Bool[Any, " points"] | None = None  # of methods that mark points that are, or were, too far away
 
 
 class Limits(eqx.Module):
@@ -136,6 +137,11 @@ class AbstractIterativeMethod(eqx.Module):
         """Whether feet between the first surface and the last need not have converged."""
         return False
 
+    @property
+    def marks(self) -> bool:
+        """Whether points that are too far away are remembered."""
+        return False
+
     @abstractmethod
     def measure(
         self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
@@ -158,17 +164,14 @@ def begin(
     none = xp.zeros(u.shape, np.int32)
     number = partial(xp.asarray, dtype=np.int32)
     empty = xp.full(bucket(most + 1, LEAST_HISTORY), np.nan, net.dtype)
-    counts, sizes, nothing, shift = None, None, None, None
+    counts, sizes, nothing = None, None, None
     if method.counts:
         counts, sizes = xp.zeros(empty.shape, np.int32), xp.zeros((2, *empty.shape), np.int32)
         nothing = number(0)
-    if method.gathers:
-        sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
-    if method.solves:
-        shift = xp.zeros((), net.dtype)
-    measured = Measured(
-        u, v, xp.zeros_like(u), none, none > 0, nothing, Pulls(sums) if method.gathers else None
-    )
+    pulls = Pulls(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
+    poor = none > 0 if method.marks else None
+    shift = xp.zeros((), net.dtype) if method.solves else None
+    measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor)
     turn = Turn(net, number(0), Records(empty, empty, empty, empty, counts, sizes), growth, shift)
     best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if method.keeps_best else None
     running = number(code_of(RESULTS.running))

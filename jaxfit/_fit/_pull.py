@@ -53,14 +53,15 @@ def pull(
     pieces: Pieces,
     u: Float[Array, " points"],
     v: Float[Array, " points"],
+    error: Float[Array, " points"],
     idle: Bool[Array, " points"],
     weigh: Callable[[Array, Array], Array],
     method: AbstractFootMethod | None,
 ) -> tuple[Float[Array, "3 points"], Pulls, Int[Array, ""]]:
     """The feet with the lengths of their residuals, the sums there, and how many points pull.
 
-    `weigh(weight, error)` says how much points pull; with a `method` each foot first takes one of its steps,
-    and its residual is the one foreseen.
+    `idle` points have no part in it, and keep the `error` they have. `weigh(weight, error)` says how much
+    points pull; with a `method` each foot first takes one of its steps, and its residual is the one foreseen.
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
     rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
@@ -94,7 +95,7 @@ def pull(
         return start + size, _Pass(feet, done.cells.at[part.cell].add(moments), active)
 
     begin = _Pass(
-        jnp.stack([u, v, jnp.zeros_like(u)]),
+        jnp.stack([u, v, error]),
         jnp.zeros((pieces.cells, order_u, order_v * (d + 1)), u.dtype),
         jnp.asarray(0, jnp.int32),
     )
