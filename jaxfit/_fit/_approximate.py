@@ -24,6 +24,7 @@ from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
 from jaxfit._fit._loop import Carry, Limits, begin, run
+from jaxfit._fit._orthogonal_distance import OrthogonalDistance
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
 from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy
 from jaxfit._precision import advise_x64, working_dtype
@@ -33,7 +34,7 @@ LEAST_POINTS = 4
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
 MOST_CONTROL_POINTS = 64  # per direction, likewise
 
-ApproximationMethod = GeometricApproximation | StandardApproximation
+ApproximationMethod = GeometricApproximation | OrthogonalDistance | StandardApproximation
 
 
 def approximate(
@@ -106,7 +107,7 @@ def approximate(
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
-    if isinstance(method, StandardApproximation):
+    if not isinstance(method, GeometricApproximation):
         method, problem = method.prepared(problem)
     size = problem.target.shape[1]
     begun = net = jnp.asarray(unit.inward(base.control_points), dtype)
@@ -215,16 +216,16 @@ def _finished(
 
 
 def _smoothing_stats(carry: Carry, problem: Problem, unit: Unit) -> dict[str, Any]:
-    """What standard approximation adds."""
+    """What methods with a thin plate add."""
     if problem.smoothing is None:
         return {}
     axes = (problem.axis_u, problem.axis_v) if carry.growth is None else carry.growth.axes
     energy = bending_energy(carry.net, *axes)
-    return {
-        "smoothing": problem.smoothing,
-        "bending_energy": energy * unit.scale**2,
-        "shift": carry.next.shift,
-    }
+    stats = {"smoothing": problem.smoothing, "bending_energy": energy * unit.scale**2}
+    trust = carry.next.trust
+    if trust is None:
+        return stats | {"shift": carry.next.shift}
+    return stats | {"damping": trust.damping, "retreats": trust.retreats}
 
 
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:

@@ -11,6 +11,7 @@ from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
+from jaxfit._fit._losses import AbstractLoss, check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._pull import pull
 from jaxfit._splines._pieces import Pieces
@@ -47,6 +48,8 @@ class GeometricApproximation(AbstractIterativeMethod):
     local : bool, default False
         Let only those points pull whose error exceeds the tolerance on the maximum error, or on the average
         error where there is none; control points they do not touch stay (section 4.1).
+    loss : Huber(), Tukey() or GemanMcClure(), optional
+        For points with outliers, which are weighed anew in each iteration; least squares by default.
     foot_method : Newton() or HuWallner()
         How feet are brought up to date (default Newton).
     foot_tolerance : float
@@ -63,6 +66,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     insertion: KnotInsertion | None = None
     fairing: Fairing | None = None
     local: bool = False
+    loss: AbstractLoss | None = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 40
@@ -86,6 +90,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         return self.foresee
 
     def __check_init__(self) -> None:
+        check_loss(self.loss)
         if not 0 < self.relaxation < 2:
             raise ValueError(
                 f"relaxation must lie between 0 and 2, where the iteration converges, but is "
@@ -127,7 +132,9 @@ class GeometricApproximation(AbstractIterativeMethod):
         bare = eqx.tree_at(lambda m: (m.active, m.pulls), measured, (None, None))
         here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
         follower = self.foot_method if self.foresees else None
-        weigh = partial(self._weigh, problem, limits)
+        # Where residuals are foreseen in the pass itself, those before it give the scale.
+        length = loss_length(self.loss, problem, here.error)
+        weigh = partial(self._weigh, problem, limits, length)
         feet, pulls, active = pull(problem, pieces, here.u, here.v, idle, weigh, follower)
         if self.foresees:
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
@@ -135,8 +142,9 @@ class GeometricApproximation(AbstractIterativeMethod):
             here = Measured(u, v, error, steps, here.found)
         return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls)
 
-    def _weigh(self, problem: Any, limits: Limits, weight: Array, error: Array) -> Array:
+    def _weigh(self, problem: Any, limits: Limits, length: Any, weight: Array, error: Array) -> Array:
         """How much points with these errors pull."""
+        weight = reweighted(self.loss, length, weight, error)
         if not self.local:
             return weight
         threshold = jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)

@@ -5,16 +5,17 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, is_concrete
+from jaxfit._checks import check_kind
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
+from jaxfit._fit._losses import AbstractLoss, check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
+from jaxfit._fit._problem import check_smoothing
 from jaxfit._normal import System, make_system, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces
 
@@ -44,6 +45,8 @@ class StandardApproximation(AbstractIterativeMethod):
         How the least-squares problem is solved (default GaussNewton, direct). All agree to rounding.
     insertion : KnotInsertion(), optional
         New knots every few rounds where the errors are greatest; none by default.
+    loss : Huber(), Tukey() or GemanMcClure(), optional
+        For points with outliers, which are weighed anew in each round; least squares by default.
     foot_method, foot_tolerance, stall_window, stall_gain
         As for GeometricApproximation.
 
@@ -65,6 +68,7 @@ class StandardApproximation(AbstractIterativeMethod):
     fixed_boundary: bool = True
     solver: Any = GaussNewton()
     insertion: KnotInsertion | None = None
+    loss: AbstractLoss | None = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 20
@@ -79,27 +83,22 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def __check_init__(self) -> None:
         check_kind("solver", self.solver, AbstractLeastSquares, "GaussNewton()")
-        if not is_concrete(self.smoothing):
-            return
-        value = np.asarray(self.smoothing, np.float64)
-        if value.ndim or not 0 <= value < np.inf:
-            raise ValueError(
-                f"smoothing must be a finite number of at least 0, but is {self.smoothing!r}; pass "
-                "lambda, for instance 2e-5."
-            )
+        check_smoothing(self.smoothing)
+        check_loss(self.loss)
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
         """With lambda moved into the problem, so that another one compiles nothing."""
-        xp: Any = np if is_concrete(self.smoothing) else jnp
-        smoothing = xp.asarray(self.smoothing, problem.target.dtype)
-        problem = eqx.tree_at(lambda p: p.smoothing, problem, smoothing, is_leaf=lambda x: x is None)
-        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem
+        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem.smoothed(self.smoothing)
 
     def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
         """The net of least squares at the present parameters."""
         axes = (pieces.axis_u, pieces.axis_v)
         held = border_on(axes, turn.net.shape, corners_only=not self.fixed_boundary)
-        net, shift = self.solver(posed(system_at(problem, pieces, measured.u, measured.v), held, turn.net))
+        weight = reweighted(
+            self.loss, loss_length(self.loss, problem, measured.error), problem.weight, measured.error
+        )
+        system = system_at(problem, pieces, measured.u, measured.v, weight)
+        net, shift = self.solver(posed(system, held, turn.net))
         before: Any = turn.shift
         step, growth = turn.step + 1, turn.growth
         if self.insertion is not None and growth is not None:
@@ -122,12 +121,12 @@ class StandardApproximation(AbstractIterativeMethod):
         return Measured(measured.u, measured.v, distance, measured.steps, ~jnp.asarray(idle), active)
 
 
-def system_at(problem: Any, pieces: Pieces, u: Array, v: Array) -> System:
-    """The least-squares problem of a fit at given parameters."""
-    return make_system(pieces, u, v, problem.target, problem.weight, problem.smoothing)
+def system_at(problem: Any, pieces: Pieces, u: Array, v: Array, weight: Array) -> System:
+    """The least-squares problem of a fit at given parameters, with weights of its points."""
+    return make_system(pieces, u, v, problem.target, weight, problem.smoothing)
 
 
 @jax.jit
 def bending_energy(net: Array, axis_u: Axis, axis_v: Axis) -> Array:
     """The integral (10) of a net."""
-    return sum(jnp.sum(x**2) for x in thin_plate(axis_u, axis_v).residual(net))  # type: ignore[return-value]
+    return thin_plate(axis_u, axis_v).energy(net)
