@@ -19,7 +19,7 @@ from jaxfit._checks import (
     is_concrete,
 )
 from jaxfit._closest import closest_point
-from jaxfit._fit._fit_result import Fit, history_of, outcome
+from jaxfit._fit._fit_result import Fit, Name, history_of, outcome
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
@@ -57,8 +57,9 @@ def approximate(
         In any order, any unit.
     base : BSplineSurface
         A first approximation, for instance from `base_surface`. Its knots are kept.
-    method : GeometricApproximation() or StandardApproximation(), optional
-        Default: GeometricApproximation().
+    method : GeometricApproximation(), OrthogonalDistance() or StandardApproximation(), optional
+        Default: GeometricApproximation(), which asks for no smoothing. OrthogonalDistance takes few passes and
+        comes closer. The fit's `stats["method"]` says which it was.
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
         diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
@@ -207,6 +208,7 @@ def _finished(
         history=history_of(carry, method),
         result=outcome(carry.code, carry.net, throw),
         stats={
+            "method": Name(type(method).__name__),
             "num_steps": carry.step,
             "diagonal": unit.diagonal,
             "unconverged_feet": xp.sum(~parts[3]),

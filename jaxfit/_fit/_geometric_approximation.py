@@ -11,7 +11,7 @@ from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._losses import AbstractLoss, check_loss, loss_length, reweighted
+from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._pull import pull
 from jaxfit._splines._pieces import Pieces
@@ -66,7 +66,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     insertion: KnotInsertion | None = None
     fairing: Fairing | None = None
     local: bool = False
-    loss: AbstractLoss | None = None
+    loss: Any = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 40

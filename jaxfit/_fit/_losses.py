@@ -6,24 +6,27 @@ and so every method takes a loss by weighing its points anew in each iteration.
 """
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
 from jaxfit._checks import check_kind, check_number
 
-# Of normally distributed residuals of a surface, distances are one-dimensional: sigma over their median.
-SIGMAS = 1.4826
+# The scale follows from the distance that this share of the points does not exceed, which is that many
+# standard deviations of residuals that are normally distributed along a normal. A median would stand more
+# outliers, but leave out all detail that a fit has not come to yet, and with it what would bring it there.
+SHARE, DEVIATIONS = 0.9, 1.6449
 
 
 class AbstractLoss(eqx.Module):
     """How much a distance counts. `scale` is a fraction of the diagonal."""
 
     scale: eqx.AbstractVar[float | None]
-    width: eqx.AbstractVar[float]  # the scale in standard deviations, where it follows from the errors
+    width: AbstractClassVar[float]  # the scale in standard deviations, where it follows from the errors
 
     @abstractmethod
     def cost(self, square: Array) -> Array:
@@ -34,14 +37,15 @@ class AbstractLoss(eqx.Module):
         """rho'(x), between 0 and 1."""
 
     def length(self, error: Any, real: Any, diagonal: Any) -> Float[Array, ""]:
-        """The scale as a length; without one, from the median of the errors of `real` points."""
+        """The scale as a length; without one, from the errors of `real` points."""
         error = jnp.asarray(error)
         if self.scale is not None:
             return jnp.asarray(self.scale, error.dtype) * diagonal
         ordered = jnp.sort(jnp.where(real, error, jnp.inf))
-        middle = (jnp.sum(real, dtype=jnp.int32) - 1) // 2
+        place = jnp.sum(real, dtype=error.dtype) * SHARE
+        place = jnp.clip(place.astype(jnp.int32), 0, error.shape[0] - 1)
         least = jnp.finfo(error.dtype).eps * diagonal
-        return jnp.maximum(self.width * SIGMAS * ordered[jnp.maximum(middle, 0)], least)
+        return jnp.maximum(self.width / DEVIATIONS * ordered[place], least)
 
 
 def _check(loss: Any) -> None:
@@ -63,7 +67,8 @@ class Huber(AbstractLoss):
     ----------
     scale : float, optional
         c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
-        estimated anew in each iteration as 1.4826 times the median distance.
+        estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
     ------
@@ -76,7 +81,7 @@ class Huber(AbstractLoss):
     """
 
     scale: float | None = None
-    width: float = eqx.field(default=1.345, init=False)
+    width: ClassVar[float] = 1.345
 
     def __check_init__(self) -> None:
         _check(self)
@@ -94,13 +99,13 @@ class Tukey(AbstractLoss):
     r"""Tukey's biweight: points farther than the scale c do not pull at all.
 
     $\rho(x) = (1 - (1 - x)^3) / 3$ up to 1. From a base surface far from the points, let the scale follow
-    from the median, or nothing may pull.
+    from the errors, or nothing may pull.
 
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in each
-        iteration as 1.4826 times the median distance.
+        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
     ------
@@ -113,7 +118,7 @@ class Tukey(AbstractLoss):
     """
 
     scale: float | None = None
-    width: float = eqx.field(default=4.685, init=False)
+    width: ClassVar[float] = 4.685
 
     def __check_init__(self) -> None:
         _check(self)
@@ -133,8 +138,9 @@ class GemanMcClure(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in each
-        iteration as 1.4826 times the median distance; with that width it pulls as Tukey's does near 0.
+        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed; with that width it pulls
+        as Tukey's does near 0.
 
     Raises
     ------
@@ -147,7 +153,7 @@ class GemanMcClure(AbstractLoss):
     """
 
     scale: float | None = None
-    width: float = eqx.field(default=4.685, init=False)
+    width: ClassVar[float] = 4.685
 
     def __check_init__(self) -> None:
         _check(self)

@@ -125,10 +125,10 @@ def tangent_entries(
 
     Of parallel tangents one counts.
     """
-    ds, dt = jnp.where(free_s, jet.s, 0.0), jnp.where(free_t, jet.t, 0.0)
+    ds, dt = jnp.where(free_s[None], jet.s, 0.0), jnp.where(free_t[None], jet.t, 0.0)
     E, F, G = (sum(x * y for x, y in zip(a, b, strict=True)) for a, b in ((ds, ds), (ds, dt), (dt, dt)))
     share = jnp.where(E > 0, F / jnp.where(E > 0, E, 1.0), 0.0)
-    across = dt - share * ds  # the part of R_t at right angles to R_s
+    across = dt - share[None] * ds  # the part of R_t at right angles to R_s
     length2 = sum(x * x for x in across)
     counts = length2 > PARALLEL * G
     per_s = jnp.where(E > 0, 1.0 / jnp.where(E > 0, E, 1.0), 0.0)

@@ -13,7 +13,7 @@ from jaxfit._checks import check_number
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._growth import Growth, KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._losses import AbstractLoss, check_loss, loss_length, reweighted, total_cost
+from jaxfit._fit._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._normal_rows import NormalRows, normal_rows
 from jaxfit._fit._problem import check_smoothing
@@ -83,17 +83,17 @@ class OrthogonalDistance(AbstractIterativeMethod):
     Far from the points the feet say little, and like the paper's methods this one may fold a surface whose
     base is too far away. Where smoothing is 0, control points that few points see may travel far.
 
-    This is tangent distance minimisation, the Gauss-Newton method for variable projection (Golub and Pereyra,
-    SIAM J. Numer. Anal. 10, 1973) of this problem, with damping: Wang, Pottmann and Liu, ACM Trans. Graph. 25,
-    2006. It runs in the loop of all fits rather than in an optimistix solver: the objective is known only when
-    feet have been found, these are taken back together with the net, and nets grow, for which the latter
+    This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
+    Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
+    2006. It runs in the loop of all fits rather than in an optimistix solver: the objective is known only
+    when feet have been found, these are taken back together with the net, and nets grow, for which the latter
     has no place.
     """
 
     smoothing: Any = 5e-6
     fixed_boundary: bool = True
     insertion: KnotInsertion | None = None
-    loss: AbstractLoss | None = None
+    loss: Any = None
     damping: float = 1e-2
     reach: float = 0.6
     foot_method: AbstractFootMethod = Newton()

@@ -13,7 +13,7 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._losses import AbstractLoss, check_loss, loss_length, reweighted
+from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._problem import check_smoothing
 from jaxfit._normal import System, make_system, thin_plate
@@ -68,7 +68,7 @@ class StandardApproximation(AbstractIterativeMethod):
     fixed_boundary: bool = True
     solver: Any = GaussNewton()
     insertion: KnotInsertion | None = None
-    loss: AbstractLoss | None = None
+    loss: Any = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 20

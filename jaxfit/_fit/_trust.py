@@ -16,7 +16,8 @@ from jaxfit._splines._pieces import Axis
 # the next one is damped less.
 POOR, GOOD = 0.25, 0.5
 RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
-LEAST_DAMPING = 1e-4
+# Below its usual least value the damping is lowered only after steps that bring about all that was foreseen.
+EXCELLENT, USUAL_DAMPING, LEAST_DAMPING = 0.9, 1e-4, 1e-12
 LONGEST_WAY = 4.0  # of a foot, in cells, in a step that brings less than GOOD
 
 
@@ -53,7 +54,8 @@ def is_plausible(trust: Trust, gain: Array, way: Array) -> Array:
 
 def next_damping(trust: Trust, gain: Array, good: Array) -> Array:
     """The damping of the step to come, by the fall of the objective against the fall foreseen."""
-    factor = jnp.where(gain > GOOD * trust.foreseen, LOWERED, 1.0)
+    enough = jnp.where(trust.damping > USUAL_DAMPING, GOOD, EXCELLENT)
+    factor = jnp.where(gain > enough * trust.foreseen, LOWERED, 1.0)
     factor = jnp.where(gain < POOR * trust.foreseen, RAISED, factor)
     factor = jnp.where(good, factor, TAKEN_BACK)
     return jnp.clip(trust.damping * factor, LEAST_DAMPING, 1.0).astype(trust.damping.dtype)
