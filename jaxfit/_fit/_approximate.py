@@ -58,8 +58,8 @@ def approximate(
     base : BSplineSurface
         A first approximation, for instance from `base_surface`. Its knots are kept.
     method : GeometricApproximation(), OrthogonalDistance() or StandardApproximation(), optional
-        Default: GeometricApproximation(), which asks for no smoothing. OrthogonalDistance takes few passes and
-        comes closer. The fit's `stats["method"]` says which it was.
+        Default: GeometricApproximation(), which asks for no smoothing. OrthogonalDistance comes closer in
+        fewer iterations. The fit's `stats["method"]` says which it was.
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
         diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
