@@ -23,10 +23,12 @@ from jaxfit._fit import Discrepancy as Discrepancy
 from jaxfit._fit import Fairing as Fairing
 from jaxfit._fit import Fit as Fit
 from jaxfit._fit import GaussNewton as GaussNewton
+from jaxfit._fit import GemanMcClure as GemanMcClure
 from jaxfit._fit import GeneralizedCrossValidation as GeneralizedCrossValidation
 from jaxfit._fit import GeometricApproximation as GeometricApproximation
 from jaxfit._fit import GeometricInterpolation as GeometricInterpolation
 from jaxfit._fit import History as History
+from jaxfit._fit import Huber as Huber
 from jaxfit._fit import ImplicitAdjoint as ImplicitAdjoint
 from jaxfit._fit import JaxoptGaussNewton as JaxoptGaussNewton
 from jaxfit._fit import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
@@ -34,9 +36,11 @@ from jaxfit._fit import KnotInsertion as KnotInsertion
 from jaxfit._fit import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._fit import NormalInterpolation as NormalInterpolation
 from jaxfit._fit import OptimalRepositioning as OptimalRepositioning
+from jaxfit._fit import OrthogonalDistance as OrthogonalDistance
 from jaxfit._fit import Richardson as Richardson
 from jaxfit._fit import StandardApproximation as StandardApproximation
 from jaxfit._fit import StandardInterpolation as StandardInterpolation
+from jaxfit._fit import Tukey as Tukey
 from jaxfit._fit import UnitWeights as UnitWeights
 from jaxfit._fit import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit import approximate as approximate

@@ -19,7 +19,11 @@ from jaxfit._fit._jaxopt import JaxoptGaussNewton as JaxoptGaussNewton
 from jaxfit._fit._jaxopt import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
 from jaxfit._fit._least_squares import GaussNewton as GaussNewton
 from jaxfit._fit._least_squares import LevenbergMarquardt as LevenbergMarquardt
+from jaxfit._fit._losses import GemanMcClure as GemanMcClure
+from jaxfit._fit._losses import Huber as Huber
+from jaxfit._fit._losses import Tukey as Tukey
 from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation
+from jaxfit._fit._orthogonal_distance import OrthogonalDistance as OrthogonalDistance
 from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight
 from jaxfit._fit._repositioning import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit._repositioning import UnitWeights as UnitWeights

@@ -40,6 +40,11 @@ class History(eqx.Module):
     refined: Bool[Array, " steps"] | None = None
 
 
+@jax.tree_util.register_static
+class Name(str):
+    """A string that is part of a tree's structure, so that results with one go through transformations."""
+
+
 class Fit(eqx.Module):
     """A fitted surface, and an honest account of how well it fits.
 
@@ -60,7 +65,8 @@ class Fit(eqx.Module):
         Why the fit stopped; `converged` and `message` say it as a boolean and as a sentence.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
-        foot was not found to the tolerance. Of an interpolation also the `tolerance` in force; other entries
+        foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
+        interpolation also the `tolerance` in force; other entries
         stand with the methods that add them.
     """
 

@@ -1,5 +1,6 @@
 """Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
+from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._pull import Pulls, pull
 from jaxfit._fit._region import region_of
@@ -48,6 +50,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         Go on only where the error exceeds the tolerance on the maximum error, or on the average error where
         there is none (section 4.1): control points move that have influence on a point which has been so far
         away, now or before; the others stay to the last bit, and points that do not feel the move rest.
+    loss : Huber(), Tukey() or GemanMcClure(), optional
+        For points with outliers, which are weighed anew in each iteration; least squares by default.
     foot_method : Newton() or HuWallner()
         How feet are brought up to date (default Newton).
     foot_tolerance : float
@@ -64,6 +68,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     insertion: KnotInsertion | None = None
     fairing: Fairing | None = None
     local: bool = False
+    loss: Any = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 40
@@ -92,6 +97,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         return self.local
 
     def __check_init__(self) -> None:
+        check_loss(self.loss)
         if not 0 < self.relaxation < 2:
             raise ValueError(
                 f"relaxation must lie between 0 and 2, where the iteration converges, but is "
@@ -137,7 +143,9 @@ class GeometricApproximation(AbstractIterativeMethod):
         bare = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
         here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
         follower = self.foot_method if self.foresees else None
-        feet, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, _all, follower)
+        # Where residuals are foreseen in the pass itself, those before it give the scale.
+        weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
+        feet, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, follower)
         if self.foresees:
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
             steps = jnp.where(exact, here.steps, 1)
@@ -154,7 +162,3 @@ class GeometricApproximation(AbstractIterativeMethod):
     def _threshold(self, limits: Limits) -> Array:
         """The error beyond which a point is poor."""
         return jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
-
-
-def _all(weight: Array, error: Array) -> Array:
-    return weight

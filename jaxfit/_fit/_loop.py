@@ -20,6 +20,7 @@ from jaxfit._checks import is_concrete
 from jaxfit._fit._growth import Growth
 from jaxfit._fit._pull import Pulls
 from jaxfit._fit._results import RESULTS
+from jaxfit._fit._trust import Trust, first_trust
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
@@ -93,6 +94,7 @@ class Turn(eqx.Module):
     records: Records
     growth: Growth | None = None  # of a net that gets more knots on the way
     shift: Float[Any, ""] | None = None  # most that a singular system has been shifted, where any is solved
+    trust: Trust | None = None  # of methods that may take a step back
 
     def axes(self, problem: Any) -> tuple[Axis, Axis]:
         """Both directions of the knots."""
@@ -131,6 +133,7 @@ class AbstractIterativeMethod(eqx.Module):
     counts: ClassVar[bool] = False  # how many points play a part, and the size of the net
     gathers: ClassVar[bool] = False  # pulls, while it measures
     solves: ClassVar[bool] = False  # systems that may be singular
+    retreats: ClassVar[bool] = False  # from steps that make the objective worse
 
     @property
     def foresees(self) -> bool:
@@ -141,6 +144,11 @@ class AbstractIterativeMethod(eqx.Module):
     def marks(self) -> bool:
         """Whether points that are too far away are remembered."""
         return False
+
+    def settle(self, problem: Any, turn: Turn, measured: Measured) -> tuple[Turn, Measured]:
+        """What has been measured, or what was before if that was better."""
+        del problem
+        return turn, measured
 
     @abstractmethod
     def measure(
@@ -172,7 +180,8 @@ def begin(
     poor = none > 0 if method.marks else None
     shift = xp.zeros((), net.dtype) if method.solves else None
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor)
-    turn = Turn(net, number(0), Records(empty, empty, empty, empty, counts, sizes), growth, shift)
+    trust = first_trust(net, u, v) if method.retreats else None
+    turn = Turn(net, number(0), Records(empty, empty, empty, empty, counts, sizes), growth, shift, trust)
     best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if method.keeps_best else None
     running = number(code_of(RESULTS.running))
     return Carry(net, number(-1), turn, measured, running, best, xp.asarray(True), growth)
@@ -214,6 +223,7 @@ def advance(
         axes = turn.axes(problem)
         pieces = pieces_on(turn.net, *axes)
         measured = method.measure(problem, limits, pieces, carry.measured, carry.exact)
+        turn, measured = method.settle(problem, turn, measured)
         records = turn.records.at(turn.step, *problem.summarise(measured, carry.measured))
         if measured.active is not None:
             records = records.counting(turn.step, measured.active, axes)

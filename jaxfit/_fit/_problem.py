@@ -32,6 +32,12 @@ class Problem(eqx.Module):
         parts = (self.target[:, order], self.weight[order], self.padding[order])
         return eqx.tree_at(lambda p: (p.target, p.weight, p.padding), self, parts)
 
+    def smoothed(self, smoothing: Any) -> "Problem":
+        """The same with a thin plate of this weight."""
+        xp: Any = np if is_concrete(smoothing) else jnp
+        value = xp.asarray(smoothing, self.target.dtype)
+        return eqx.tree_at(lambda p: p.smoothing, self, value, is_leaf=lambda x: x is None)
+
     def summarise(self, measured: Any, before: Any) -> tuple[Array, Array, Array, Array]:
         """Of the true points: average and maximum error as fractions of the diagonal, then averages of the
         evaluations for a foot and of its change of parameters.
@@ -42,6 +48,18 @@ class Problem(eqx.Module):
         rows = jnp.where((self.padding > 0)[None], rows, 0.0)
         average, evaluations, change = jnp.sum(rows, axis=1) / jnp.sum(self.padding)
         return average, jnp.max(rows[0]), evaluations, change
+
+
+def check_smoothing(smoothing: Any) -> None:
+    """Lambda is a finite number of at least 0, unless it is traced."""
+    if not is_concrete(smoothing):
+        return
+    value = np.asarray(smoothing, np.float64)
+    if value.ndim or not 0 <= value < np.inf:
+        raise ValueError(
+            f"smoothing must be a finite number of at least 0, but is {smoothing!r}; pass "
+            "lambda, for instance 2e-5."
+        )
 
 
 class Unit(eqx.Module):

@@ -5,18 +5,19 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool
 
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, is_concrete
+from jaxfit._checks import check_kind
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._automatic_smoothing import AbstractSmoothing, chosen
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
+from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
+from jaxfit._fit._problem import check_smoothing
 from jaxfit._normal import System, make_system, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces
 
@@ -47,6 +48,8 @@ class StandardApproximation(AbstractIterativeMethod):
         How the least-squares problem is solved (default GaussNewton, direct). All agree to rounding.
     insertion : KnotInsertion(), optional
         New knots every few rounds where the errors are greatest; none by default.
+    loss : Huber(), Tukey() or GemanMcClure(), optional
+        For points with outliers, which are weighed anew in each round; least squares by default.
     foot_method, foot_tolerance, stall_window, stall_gain
         As for GeometricApproximation.
 
@@ -68,6 +71,7 @@ class StandardApproximation(AbstractIterativeMethod):
     fixed_boundary: bool = True
     solver: Any = GaussNewton()
     insertion: KnotInsertion | None = None
+    loss: Any = None
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 20
@@ -82,23 +86,14 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def __check_init__(self) -> None:
         check_kind("solver", self.solver, AbstractLeastSquares, "GaussNewton()")
-        if isinstance(self.smoothing, AbstractSmoothing) or not is_concrete(self.smoothing):
-            return
-        value = np.asarray(self.smoothing, np.float64)
-        if value.ndim or not 0 <= value < np.inf:
-            raise ValueError(
-                f"smoothing must be a finite number of at least 0, but is {self.smoothing!r}; pass "
-                "lambda, for instance 2e-5."
-            )
+        if not isinstance(self.smoothing, AbstractSmoothing):
+            check_smoothing(self.smoothing)
+        check_loss(self.loss)
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
         """With lambda moved into the problem, so that another one compiles nothing; 0 until it is chosen."""
-        if isinstance(self.smoothing, AbstractSmoothing):
-            return eqx.tree_at(lambda m: m.smoothing, self, 0.0).prepared(problem)
-        xp: Any = np if is_concrete(self.smoothing) else jnp
-        smoothing = xp.asarray(self.smoothing, problem.target.dtype)
-        problem = eqx.tree_at(lambda p: p.smoothing, problem, smoothing, is_leaf=lambda x: x is None)
-        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem
+        value = 0.0 if isinstance(self.smoothing, AbstractSmoothing) else self.smoothing
+        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem.smoothed(value)
 
     def held(self, axes: tuple[Axis, Axis], net: Array) -> Bool[Array, "nu nv"]:
         """Which control points stay."""
@@ -106,8 +101,9 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def system(self, problem: Any, pieces: Pieces, measured: Measured) -> System:
         """The least-squares problem at the present parameters."""
-        u, v = measured.u, measured.v
-        return make_system(pieces, u, v, problem.target, problem.weight, problem.smoothing)
+        length = loss_length(self.loss, problem, measured.error)
+        weight = reweighted(self.loss, length, problem.weight, measured.error)
+        return make_system(pieces, measured.u, measured.v, problem.target, weight, problem.smoothing)
 
     def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
         """The net of least squares at the present parameters."""
@@ -145,4 +141,4 @@ def with_smoothing(
 @jax.jit
 def bending_energy(net: Array, axis_u: Axis, axis_v: Axis) -> Array:
     """The integral (10) of a net."""
-    return sum(jnp.sum(x**2) for x in thin_plate(axis_u, axis_v).residual(net))  # type: ignore[return-value]
+    return thin_plate(axis_u, axis_v).energy(net)

@@ -1,5 +1,9 @@
 """Normal matrices of least-squares fits as stencils on the net, thin plates, and their solvers."""
 
+from jaxfit._normal._coupled import CoupledStencil as CoupledStencil
+from jaxfit._normal._coupled import coupled_stencil as coupled_stencil
+from jaxfit._normal._coupled_solver import coupled_cg as coupled_cg
+from jaxfit._normal._coupled_solver import preconditioner as preconditioner
 from jaxfit._normal._curvature_energy import curvature_energy as curvature_energy
 from jaxfit._normal._operator import BlockCholesky as BlockCholesky
 from jaxfit._normal._operator import NormalOperator as NormalOperator

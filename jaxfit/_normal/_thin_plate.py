@@ -51,6 +51,10 @@ class ThinPlate(eqx.Module):
         ]
         return parts[0], parts[1], parts[2]
 
+    def energy(self, net: Float[Array, "nu nv c"]) -> Float[Array, ""]:
+        """F_s itself."""
+        return sum(jnp.sum(x**2) for x in self.residual(net))  # type: ignore[return-value]
+
     def adjoint(self, residual: Bending) -> Float[Array, "nu nv c"]:
         """L^T times such values; of L P the gradient of F_s / 2."""
         total: Any = 0.0

@@ -1,0 +1,190 @@
+r"""What distances cost: losses that outliers do not dominate, as objects.
+
+A fit with a loss minimises $\sum_k w_k\, c^2 \rho(|e_k|^2 / c^2)$, where least squares has
+$\sum_k w_k |e_k|^2$. Its gradient is that of least squares with the weights $w_k \rho'(|e_k|^2 / c^2)$,
+and so every method takes a loss by weighing its points anew in each iteration.
+"""
+
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from equinox import AbstractClassVar
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._checks import check_kind, check_number
+
+# The scale follows from the distance that this share of the points does not exceed, which is that many
+# standard deviations of residuals that are normally distributed along a normal. A median would stand more
+# outliers, but leave out all detail that a fit has not come to yet, and with it what would bring it there.
+SHARE, DEVIATIONS = 0.9, 1.6449
+
+
+class AbstractLoss(eqx.Module):
+    """How much a distance counts. `scale` is a fraction of the diagonal."""
+
+    scale: eqx.AbstractVar[float | None]
+    width: AbstractClassVar[float]  # the scale in standard deviations, where it follows from the errors
+
+    @abstractmethod
+    def cost(self, square: Array) -> Array:
+        """rho(x) of squares of distances in units of the scale; rho(x) = x near 0."""
+
+    @abstractmethod
+    def pull(self, square: Array) -> Array:
+        """rho'(x), between 0 and 1."""
+
+    def length(self, error: Any, real: Any, diagonal: Any) -> Float[Array, ""]:
+        """The scale as a length; without one, from the errors of `real` points."""
+        error = jnp.asarray(error)
+        if self.scale is not None:
+            return jnp.asarray(self.scale, error.dtype) * diagonal
+        ordered = jnp.sort(jnp.where(real, error, jnp.inf))
+        place = jnp.sum(real, dtype=error.dtype) * SHARE
+        place = jnp.clip(place.astype(jnp.int32), 0, error.shape[0] - 1)
+        least = jnp.finfo(error.dtype).eps * diagonal
+        return jnp.maximum(self.width / DEVIATIONS * ordered[place], least)
+
+
+def _check(loss: Any) -> None:
+    if loss.scale is not None:
+        check_number("scale", loss.scale, 0.0)
+        if not loss.scale > 0:
+            raise ValueError(
+                f"scale must be greater than 0, but is {loss.scale!r}; pass a fraction of the diagonal, "
+                "or None."
+            )
+
+
+class Huber(AbstractLoss):
+    r"""Distances beyond the scale c count $2 c |e| - c^2$: linearly, no more.
+
+    The objective stays convex in the distances, and outliers keep a bounded pull.
+
+    Parameters
+    ----------
+    scale : float, optional
+        c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
+        estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed.
+
+    Raises
+    ------
+    ValueError
+        If `scale` is not positive.
+
+    Notes
+    -----
+    P. J. Huber, Robust estimation of a location parameter, Ann. Math. Statist. 35, 1964.
+    """
+
+    scale: float | None = None
+    width: ClassVar[float] = 1.345
+
+    def __check_init__(self) -> None:
+        _check(self)
+
+    def cost(self, square: Array) -> Array:
+        """x up to 1, then 2 sqrt(x) - 1."""
+        return jnp.where(square <= 1, square, 2.0 * jnp.sqrt(jnp.maximum(square, 1.0)) - 1.0)
+
+    def pull(self, square: Array) -> Array:
+        """1 up to 1, then 1 / sqrt(x)."""
+        return 1.0 / jnp.sqrt(jnp.maximum(square, 1.0))
+
+
+class Tukey(AbstractLoss):
+    r"""Tukey's biweight: points farther than the scale c do not pull at all.
+
+    $\rho(x) = (1 - (1 - x)^3) / 3$ up to 1. From a base surface far from the points, let the scale follow
+    from the errors, or nothing may pull.
+
+    Parameters
+    ----------
+    scale : float, optional
+        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed.
+
+    Raises
+    ------
+    ValueError
+        If `scale` is not positive.
+
+    Notes
+    -----
+    A. E. Beaton and J. W. Tukey, Technometrics 16, 1974.
+    """
+
+    scale: float | None = None
+    width: ClassVar[float] = 4.685
+
+    def __check_init__(self) -> None:
+        _check(self)
+
+    def cost(self, square: Array) -> Array:
+        """(1 - (1 - x)^3) / 3 up to 1, then 1/3."""
+        return (1.0 - jnp.maximum(1.0 - square, 0.0) ** 3) / 3.0
+
+    def pull(self, square: Array) -> Array:
+        """(1 - x)^2 up to 1, then 0."""
+        return jnp.maximum(1.0 - square, 0.0) ** 2
+
+
+class GemanMcClure(AbstractLoss):
+    r"""$\rho(x) = x / (1 + x)$: the pull of far points fades like the fourth power of their distance.
+
+    Parameters
+    ----------
+    scale : float, optional
+        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed; with that width it pulls
+        as Tukey's does near 0.
+
+    Raises
+    ------
+    ValueError
+        If `scale` is not positive.
+
+    Notes
+    -----
+    S. Geman and D. E. McClure, Bull. Int. Statist. Inst. 52, 1987.
+    """
+
+    scale: float | None = None
+    width: ClassVar[float] = 4.685
+
+    def __check_init__(self) -> None:
+        _check(self)
+
+    def cost(self, square: Array) -> Array:
+        """x / (1 + x)."""
+        return square / (1.0 + square)
+
+    def pull(self, square: Array) -> Array:
+        """1 / (1 + x)^2."""
+        return 1.0 / (1.0 + square) ** 2
+
+
+def check_loss(loss: Any) -> None:
+    """A loss, or None for least squares."""
+    if loss is not None:
+        check_kind("loss", loss, AbstractLoss, "Huber()")
+
+
+def loss_length(loss: AbstractLoss | None, problem: Any, error: Any) -> Any:
+    """The scale of a loss as a length, from the errors if it has none; None for least squares."""
+    return None if loss is None else loss.length(error, problem.padding > 0, problem.diagonal)
+
+
+def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:
+    """How much points pull at distances `error`."""
+    return weight if loss is None else weight * loss.pull((error / length) ** 2)
+
+
+def total_cost(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Float[Array, ""]:
+    """The objective without its thin plate."""
+    if loss is None:
+        return jnp.sum(weight * error**2)
+    return jnp.sum(weight * loss.cost((error / length) ** 2)) * length**2

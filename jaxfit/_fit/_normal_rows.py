@@ -1,0 +1,140 @@
+r"""One Gauss-Newton step on the true distances: rows, normal equations and gradient, in one pass.
+
+With the foot $u^*(P)$ of a point eliminated, the residual $r = R(u^*(P)) - Q$ has the derivative
+
+$$dr = (I - J H^{-1} J^T)\, B\, dP + J H^{-1} (B_u dP \cdot e,\; B_v dP \cdot e), \qquad e = -r,$$
+
+where $B\,dP$ is the change of the surface at fixed parameters, J the tangents $[R_u, R_v]$ and
+$H = J^T J - e \cdot R_{(uu, uv, vv)}$ the Hessian of half the squared distance. With the projection $\Pi$
+on the normal space, $\Pi J = 0$ and so $\Pi\, dr = \Pi\, B\, dP$ exactly, curved or not; and r lies in the
+normal space. What is left, in the tangent space, is of the size of curvature times distance, and does not
+change the length of r to first order: $d|r| = (r / |r|) \cdot B\, dP$. So the rows are $\Pi B$, for a
+surface in space $n^T B$. At a foot on the border only directions in which it is free to move are in J.
+
+$\Pi + \mu (I - \Pi)$ in place of $\Pi$ blends these rows with those at fixed parameters, where mu is 1.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._cells import (
+    Jet,
+    Rows,
+    cells_to_net,
+    evaluate_jet,
+    local_coordinates,
+    row_coefficients,
+    row_moments,
+    row_width,
+    rows_of,
+    staged,
+)
+from jaxfit._closest import SLOTS_PER_BLOCK
+from jaxfit._normal import CoupledStencil, coupled_stencil
+from jaxfit._splines._pieces import Pieces
+
+PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count as none
+
+
+class NormalRows(eqx.Module):
+    """A^T A and A^T e of the rows A = (Pi + mu (I - Pi))^(1/2) B, weighted."""
+
+    matrix: CoupledStencil
+    gradient: Float[Array, "nu nv d"]
+
+
+class _Sums(eqx.Module):
+    squares: Float[Array, "cells A Bp"]
+    pulls: Float[Array, "cells K Lc"]
+
+
+def normal_rows(
+    problem: Any,
+    pieces: Pieces,
+    u: Float[Array, " points"],
+    v: Float[Array, " points"],
+    weight: Float[Array, " points"],
+    damping: Float[Array, ""],
+) -> NormalRows:
+    """The normal equations at feet (u, v), for `damping` mu; points of weight 0 take no part."""
+    pieces = jax.tree.map(jnp.asarray, pieces)
+    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), weight <= 0)
+    count, width = rows.point.shape
+    on_cpu = jax.default_backend() == "cpu"
+    size = min(count, max(SLOTS_PER_BLOCK // width, 1)) if on_cpu else count
+    (order_u, order_v), d = pieces.order, problem.target.shape[0]
+    pairs = d * (d + 1) // 2
+    always = problem.diagonal > 0
+    values = jnp.concatenate([problem.target, jnp.stack([u, v, weight])])
+
+    def block(carry: tuple[Array, _Sums]) -> tuple[Array, _Sums]:
+        start, done = carry
+        part = rows.block(start, size)
+        # The last block is moved back where fewer rows are left; those before it have been counted.
+        fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
+        filled = part.filled & fresh[:, None]
+        s, t, e, entries = staged(always, _rows_at, pieces, part, part.spread(values), filled, damping)
+        squares = row_moments(s, t, entries, 2 * order_u - 1, 2 * order_v - 1)
+        pulls = row_moments(s, t, e, order_u, order_v)
+        sums = _Sums(done.squares.at[part.cell].add(squares), done.pulls.at[part.cell].add(pulls))
+        return start + size, sums
+
+    begin = _Sums(
+        jnp.zeros((pieces.cells, 2 * order_u - 1, (2 * order_v - 1) * pairs), u.dtype),
+        jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype),
+    )
+    zero = jnp.asarray(0, jnp.int32)
+    done = lax.while_loop(lambda x: x[0] < rows.used, block, (zero, begin))[1]
+    matrix = coupled_stencil(done.squares, pieces.axis_u, pieces.axis_v, pairs)
+    gradient = cells_to_net(done.pulls, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
+    return NormalRows(matrix, gradient)
+
+
+def _rows_at(
+    pieces: Pieces, part: Rows, here: Array, filled: Array, damping: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Local coordinates, weighted residuals, and the entries of w (Pi + mu (I - Pi))."""
+    target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
+    s, t = local_coordinates(pieces, part.cell[:, None], u, v)
+    jet = staged(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, row_coefficients(pieces, part), s, t)
+    e = target - jet.value
+    free_s = ~pushed_out(pieces.axis_u, u, e, jet.s)
+    free_t = ~pushed_out(pieces.axis_v, v, e, jet.t)
+    tangential = tangent_entries(jet, free_s, free_t)
+    d = target.shape[0]
+    same = jnp.asarray(np.equal(*np.triu_indices(d)), s.dtype)[:, None, None]
+    return s, t, weight[None] * e, weight[None] * (same - (1.0 - damping) * tangential)
+
+
+def pushed_out(axis: Any, u: Array, e: Array, tangent: Array) -> Array:
+    """Whether a foot lies on an end of the domain and its residual keeps it there."""
+    along = sum(x * y for x, y in zip(e, tangent, strict=True))
+    return ((u <= axis.breaks[0]) & (along < 0)) | ((u >= axis.breaks[-1]) & (along > 0))
+
+
+def tangent_entries(
+    jet: Jet, free_s: Bool[Array, "..."], free_t: Bool[Array, "..."]
+) -> Float[Array, "pairs ..."]:
+    """The projection I - Pi on the free tangent directions, its entries on and above the diagonal.
+
+    Of parallel tangents one counts.
+    """
+    ds, dt = jnp.where(free_s[None], jet.s, 0.0), jnp.where(free_t[None], jet.t, 0.0)
+    E, F, G = (sum(x * y for x, y in zip(a, b, strict=True)) for a, b in ((ds, ds), (ds, dt), (dt, dt)))
+    share = jnp.where(E > 0, F / jnp.where(E > 0, E, 1.0), 0.0)
+    across = dt - share[None] * ds  # the part of R_t at right angles to R_s
+    length2 = sum(x * x for x in across)
+    counts = length2 > PARALLEL * G
+    per_s = jnp.where(E > 0, 1.0 / jnp.where(E > 0, E, 1.0), 0.0)
+    per_t = jnp.where(counts, 1.0 / jnp.where(counts, length2, 1.0), 0.0)
+    rows, columns = np.triu_indices(ds.shape[0])
+    entries = [
+        per_s * ds[a] * ds[b] + per_t * across[a] * across[b] for a, b in zip(rows, columns, strict=True)
+    ]
+    return jnp.stack(entries)

@@ -1,0 +1,212 @@
+"""Orthogonal distance: Gauss-Newton on the true distances, with the feet eliminated."""
+
+from functools import partial
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._cells import staged
+from jaxfit._checks import check_number
+from jaxfit._closest import AbstractFootMethod, Newton
+from jaxfit._fit._growth import Growth, KnotInsertion
+from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
+from jaxfit._fit._losses import check_loss, loss_length, reweighted, total_cost
+from jaxfit._fit._measure import border_on, measure_feet
+from jaxfit._fit._normal_rows import NormalRows, normal_rows
+from jaxfit._fit._problem import check_smoothing
+from jaxfit._fit._trust import Trust, farthest_move, is_plausible, next_damping, within_reach
+from jaxfit._normal import Stencil, coupled_cg, preconditioner, thin_plate
+from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+
+RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
+MOST_STEPS = 60  # of conjugate gradients
+
+
+class OrthogonalDistance(AbstractIterativeMethod):
+    r"""Minimise the true distances of the points over the control points, by Gauss-Newton steps.
+
+    With the closest point $u_k^*(P)$ of every point eliminated, minimises
+
+    $$F = \sum_k w_k |Q_k - R(u_k^*(P))|^2 + \lambda F_s(P),$$
+
+    $F_s$ being the thin plate (10) of `StandardApproximation`. That method holds the parameters while it
+    solves, so that a point resists every move of the surface; here it resists only moves along the normal
+    $n_k$, and the net is free to slide to where the detail is. Each step solves
+
+    $$\Big(\sum_k w_k B_k^T (\Pi_k + \mu (I - \Pi_k)) B_k + \lambda A_{fair}\Big)\, \delta P
+      = \sum_k w_k B_k^T (Q_k - R_k) - \lambda A_{fair} P,$$
+
+    with the basis functions $B_k$ at the foot and the projection $\Pi_k$ on the normal space, for a surface
+    in space $n_k n_k^T$. At a foot on the border of the domain only those tangent directions are taken off in
+    which it is free to move. These rows are the exact derivative of the residual in the normal
+    space, whatever the curvature; what is left out lies in the tangent space and is of second order in the
+    distances.
+
+    The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
+    the distance at the old parameters is at least the new one. The first step has mu = 1; after it mu
+    follows the fall of F against the one foreseen. A step after which F, measured at converged feet, has
+    not fallen is taken back, so that F never rises; so is one in which a foot has moved by several cells
+    without the fall that was foreseen. It counts as an iteration, with the errors of the surface it went
+    back to.
+
+    Parameters
+    ----------
+    smoothing : float
+        lambda (default 5e-6), as for `StandardApproximation`; 0 for none. May be traced.
+    fixed_boundary : bool
+        Hold the border control points (section 2.3 of the paper); otherwise only the four corners.
+    insertion : KnotInsertion(), optional
+        New knots every few iterations where the errors are greatest; none by default.
+    loss : Huber(), Tukey() or GemanMcClure(), optional
+        For points with outliers; least squares by default.
+    damping : float
+        mu of the second step, in (0, 1] (default 0.01).
+    reach : float
+        Most that a control point moves in a step with mu below 1, as a share of the distance to its
+        neighbours (default 0.6).
+    foot_method, foot_tolerance, stall_window, stall_gain
+        As for GeometricApproximation.
+
+    Raises
+    ------
+    ValueError
+        If `smoothing` is negative or not finite, `damping` not in (0, 1], or `reach` not positive.
+
+    Notes
+    -----
+    The fit's `stats` say `smoothing`; `bending_energy`, $F_s$ in the squared unit of the data; `damping`, the
+    last mu; and `retreats`, how many steps were taken back.
+
+    Far from the points the feet say little, and like the paper's methods this one may fold a surface whose
+    base is too far away. Where smoothing is 0, control points that few points see may travel far.
+
+    This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
+    Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
+    2006. It runs in the loop of all fits rather than in an optimistix solver: the objective is known only
+    when feet have been found, these are taken back together with the net, and nets grow, for which the latter
+    has no place.
+    """
+
+    smoothing: Any = 5e-6
+    fixed_boundary: bool = True
+    insertion: KnotInsertion | None = None
+    loss: Any = None
+    damping: float = 1e-2
+    reach: float = 0.6
+    foot_method: AbstractFootMethod = Newton()
+    foot_tolerance: float = 1e-12
+    stall_window: int = 20
+    stall_gain: float = 2e-3
+
+    counts: ClassVar[bool] = True
+    retreats: ClassVar[bool] = True
+
+    def __check_init__(self) -> None:
+        check_smoothing(self.smoothing)
+        check_loss(self.loss)
+        if not 0 < self.damping <= 1:
+            raise ValueError(
+                f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."
+            )
+        check_number("reach", self.reach, 0.0)
+        if self.reach == 0:
+            raise ValueError("reach must be greater than 0, but is 0; the default is 0.6.")
+
+    def prepared(self, problem: Any) -> tuple["OrthogonalDistance", Any]:
+        """With lambda moved into the problem, so that another one compiles nothing."""
+        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem.smoothed(self.smoothing)
+
+    def measure(
+        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
+    ) -> Measured:
+        """Feet from the last accepted ones."""
+        idle = problem.padding <= 0
+        feet = measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
+        active = jnp.sum(problem.weight > 0, dtype=jnp.int32)
+        return eqx.tree_at(lambda m: m.active, feet, active, is_leaf=lambda x: x is None)
+
+    def settle(self, problem: Any, turn: Turn, measured: Measured) -> tuple[Turn, Measured]:
+        """The surface just measured if its objective is lower, or the one before."""
+        trust: Any = turn.trust
+        first = turn.step == 0
+        axes, weight = turn.axes(problem), true_weight(problem)
+        bending = problem.smoothing * thin_plate(*axes).energy(turn.net)
+        # Both surfaces are judged by one scale of the loss.
+        length = loss_length(self.loss, problem, jnp.where(first, measured.error, trust.error))
+        gain = total_cost(self.loss, length, weight, trust.error) + trust.bending
+        gain = gain - total_cost(self.loss, length, weight, measured.error) - bending
+        way = farthest_move(axes, (trust.u, trust.v), (measured.u, measured.v), weight > 0)
+        good = first | ((gain > 0) & is_plausible(trust, gain, way))
+        damping = jnp.where(turn.step == 1, self.damping, next_damping(trust, gain, good))
+        damping = jnp.where(first, trust.damping, damping)
+        here = (turn.net, measured.u, measured.v, measured.error, measured.found, bending)
+        kept = (trust.net, trust.u, trust.v, trust.error, trust.found, trust.bending)
+        net, u, v, error, found, bending = lax.cond(good, lambda: here, lambda: kept)
+        retreats = trust.retreats + ~good
+        trust = Trust(net, u, v, error, found, bending, trust.foreseen, damping, retreats)
+        measured = Measured(u, v, error, measured.steps, found, measured.active)
+        return Turn(net, turn.step, turn.records, turn.growth, turn.shift, trust), measured
+
+    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
+        """New knots, and a step to be judged once it has been measured."""
+        trust: Any = turn.trust
+        net, growth = self._refined(problem, measured, turn)
+        axes = turn.axes(problem) if growth is None else growth.axes
+        length = loss_length(self.loss, problem, measured.error)
+        weight = reweighted(self.loss, length, true_weight(problem), measured.error)
+        held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
+        always = problem.diagonal > 0
+        rows = staged(
+            always,
+            lambda net, *x: normal_rows(problem, pieces_on(net, *axes), *x),
+            *(net, measured.u, measured.v, weight, trust.damping),
+        )
+        solve = partial(_stepped, axes, problem.smoothing, self.reach)
+        following, foreseen = staged(always, solve, rows, net, held, trust.damping)
+        trust = eqx.tree_at(lambda t: (t.net, t.foreseen), trust, (net, foreseen))
+        return Turn(following, turn.step + 1, turn.records, growth, turn.shift, trust)
+
+    def _refined(self, problem: Any, measured: Measured, turn: Turn) -> tuple[Array, Growth | None]:
+        """The accepted net with new knots if it is time: the surface, and so its feet, are the same."""
+        net, growth = turn.net, turn.growth
+        if self.insertion is None or growth is None:
+            return net, growth
+        return lax.cond(
+            turn.step > 0,
+            partial(self.insertion, turn.step, measured=measured, real=problem.padding > 0),
+            lambda net, growth: (net, growth),
+            *(net, growth),
+        )
+
+
+def true_weight(problem: Any) -> Array:
+    """Weights of the points, 0 for padding."""
+    return jnp.where(problem.padding > 0, problem.weight, 0.0)
+
+
+def _stepped(
+    axes: tuple[Axis, Axis],
+    smoothing: Any,
+    reach: float,
+    rows: NormalRows,
+    net: Float[Array, "nu nv d"],
+    held: Bool[Array, "nu nv"],
+    damping: Float[Array, ""],
+) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    """The net after the step, and by how much the objective should fall."""
+    plate = thin_plate(*axes)
+    stiffness = plate.stencil()
+    matrix = rows.matrix.plus(stiffness, smoothing)
+    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
+    scale = 1.0 + (net.shape[2] - 1) * damping
+    uncoupled = Stencil(rows.matrix.trace.entries / scale).plus(stiffness, smoothing)
+    free = jnp.asarray(uncoupled.diagonal > 0) & ~held
+    right = rows.gradient - smoothing * plate.adjoint(plate.residual(net))
+    right = jnp.where(free[:, :, None], right, 0.0)
+    near = preconditioner(matrix, uncoupled, free)
+    move = coupled_cg(matrix, right, free, near, RESIDUAL, MOST_STEPS)
+    move = jnp.where(damping < 1, within_reach(net, move, reach), move)
+    return net + move, jnp.sum(move * (2.0 * right - matrix(move)))

@@ -1,0 +1,100 @@
+"""Robust losses: their weights are the derivatives of their costs, and outliers do not spoil a fit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import diagonal, wavy_cloud
+
+import jaxfit as jf
+from jaxfit._fit._losses import reweighted, total_cost
+
+POINTS, EDGES = wavy_cloud(500)
+LOSSES = [jf.Huber(), jf.Tukey(), jf.GemanMcClure()]
+
+
+def named(x):
+    return type(x).__name__
+
+
+@pytest.fixture(scope="module")
+def base():
+    return jf.base_surface(jf.Boundary(**EDGES), net=(8, 7))
+
+
+@pytest.fixture(scope="module")
+def wild():
+    """The cloud with 5 % gross outliers."""
+    rng = np.random.default_rng(3)
+    points = POINTS.copy()
+    points[rng.choice(500, 25, replace=False), 2] += rng.uniform(0.1, 0.3, 25)
+    return points
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=named)
+def test_the_pull_is_the_derivative_of_the_cost(loss):
+    square = jnp.asarray([0.0, 0.1, 0.5, 0.9, 1.5, 4.0, 100.0])
+    slope = jax.vmap(jax.grad(loss.cost))(square)
+    assert np.abs(np.asarray(slope - loss.pull(square))).max() < 1e-12
+    assert float(loss.cost(jnp.asarray(0.0))) == 0
+    assert float(loss.pull(jnp.asarray(0.0))) == 1
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=named)
+def test_the_scale_follows_from_the_points(loss):
+    rng = np.random.default_rng(0)
+    error = jnp.asarray(np.abs(rng.normal(size=4001)) * 0.01)
+    real = jnp.arange(4001) < 4000
+    length = float(loss.length(error.at[-1].set(1e6), real, jnp.asarray(3.0)))
+    assert abs(length - 0.01 * loss.width) < 0.03 * length
+    fixed = type(loss)(scale=0.02)
+    assert float(fixed.length(error, real, jnp.asarray(3.0))) == pytest.approx(0.06)
+
+
+def test_least_squares_is_no_loss_at_all():
+    weight, error = jnp.ones(3), jnp.arange(3.0)
+    assert reweighted(None, None, weight, error) is weight
+    assert float(total_cost(None, None, weight, error)) == 5.0
+    far = total_cost(jf.Tukey(scale=1.0), jnp.asarray(1e3), weight, error)
+    assert abs(float(far) - 5.0) < 1e-4
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=named)
+def test_outliers_do_not_spoil_orthogonal_distance(base, wild, loss):
+    assert spoilt(jf.OrthogonalDistance(loss=loss), base, wild, 10) < 5e-4
+
+
+@pytest.mark.parametrize(
+    ("method", "steps"),
+    [(jf.StandardApproximation(loss=jf.Tukey()), 10), (jf.GeometricApproximation(loss=jf.Tukey()), 60)],
+    ids=named,
+)
+def test_outliers_do_not_spoil_the_other_methods(base, wild, method, steps):
+    assert spoilt(method, base, wild, steps) < 1e-3
+
+
+def test_outliers_spoil_least_squares(base, wild):
+    assert spoilt(jf.OrthogonalDistance(), base, wild, 10) > 3e-3
+
+
+def spoilt(method, base, wild, steps):
+    """Average distance of the clean points from a surface fitted to the others, against the diagonal."""
+    fit = jf.approximate(wild, base, method, max_steps=steps, tol_average=1e-12)
+    return float(jnp.mean(jf.closest_point(fit.surface, POINTS).distance)) / diagonal(POINTS)
+
+
+@pytest.mark.parametrize("kind", [jf.Huber, jf.Tukey, jf.GemanMcClure], ids=lambda x: x.__name__)
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan])
+def test_impossible_scales_get_a_sentence(kind, scale):
+    with pytest.raises(ValueError, match="scale"):
+        kind(scale=scale)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [jf.GeometricApproximation, jf.OrthogonalDistance, jf.StandardApproximation],
+    ids=lambda x: x.__name__,
+)
+def test_a_loss_of_another_kind_gets_a_sentence(kind):
+    with pytest.raises(TypeError, match="loss must be an object"):
+        kind(loss="huber")

@@ -1,0 +1,218 @@
+"""Orthogonal distance: its rows are the derivative of the true distances, and no step makes them worse."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import data, diagonal, eps, wavy_cloud
+from normal_reference import thin_plate_matrix
+
+import jaxfit as jf
+from jaxfit._fit._approximate import unit_of
+from jaxfit._fit._normal_rows import normal_rows
+from jaxfit._fit._problem import axes_of, make_problem
+from jaxfit._fit._trust import LEAST_DAMPING, first_trust, next_damping, within_reach
+from jaxfit._normal import coupled_cg, preconditioner
+from jaxfit._splines._pieces import pieces_on
+
+POINTS, EDGES = wavy_cloud(500)
+BOUNDARY = jf.Boundary(**EDGES)
+SMOOTHING = 1e-6
+
+
+@pytest.fixture(scope="module")
+def base():
+    return jf.base_surface(BOUNDARY, net=(8, 7))
+
+
+@pytest.fixture(scope="module")
+def fit(base):
+    method = jf.OrthogonalDistance(smoothing=SMOOTHING)
+    return jf.approximate(POINTS, base, method, max_steps=8, tol_average=1e-9)
+
+
+@pytest.fixture(scope="module")
+def laid_out(base):
+    """A problem with some points beyond the border, feet on the base, and the normal equations there."""
+    cloud = POINTS.copy()
+    cloud[:40, 0] -= 1.1 * cloud[:40, 0] + 0.02
+    cloud[:, 2] += 0.05
+    unit = unit_of(cloud)
+    problem = make_problem(cloud, None, axes_of(base, np.dtype(float)), unit, 1e-12)
+    net = jnp.asarray(unit.inward(base.control_points))
+    feet = jf.closest_point(jf.BSplineSurface(net, base.knots_u, base.knots_v), unit.inward(cloud))
+    pad = problem.target.shape[1] - len(cloud)
+    u, v = (jnp.pad(x, (0, pad)) for x in (feet.u, feet.v))
+
+    @jax.jit
+    def compute(problem, net, u, v, weight, mu):
+        return normal_rows(problem, pieces_on(net, problem.axis_u, problem.axis_v), u, v, weight, mu)
+
+    def rows(mu, counts=1.0):
+        weight = jnp.pad(counts * jnp.ones(len(cloud)), (0, pad))
+        return compute(problem, net, u, v, weight, jnp.asarray(mu))
+
+    return problem, net, feet, rows
+
+
+def slope(problem, net, base, feet, along):
+    """d |Q_k - R(u*_k)| along a change of the net, by central differences of feet found anew."""
+    points = problem.target.T[: feet.u.shape[0]]
+
+    def distances(net):
+        surface = jf.BSplineSurface(net, base.knots_u, base.knots_v)
+        return jf.closest_point(surface, points, start=(feet.u, feet.v)).distance
+
+    return (distances(net + 1e-5 * along) - distances(net - 1e-5 * along)) / 2e-5
+
+
+def test_gradient_and_normal_matrix_are_those_of_the_true_distances(base, laid_out):
+    problem, net, feet, rows = laid_out
+    inside = (feet.u > 0) & (feet.u < 1) & (feet.v > 0) & (feet.v < 1)
+    assert 0 < int(jnp.sum(~inside)) < 100
+    every, inner = rows(0.0), rows(0.0, inside)
+    for seed in range(3):
+        along = jnp.asarray(np.random.default_rng(seed).normal(size=net.shape))
+        change = slope(problem, net, base, feet, along)
+        fall = -jnp.sum(feet.distance * change)
+        assert abs(float(jnp.sum(every.gradient * along) / fall) - 1) < 1e-6
+        # In the normal space of a point beyond the border lies more than its distance.
+        square, most = (float(jnp.sum(along * x.matrix(along))) for x in (inner, every))
+        assert abs(square / float(jnp.sum((inside * change) ** 2)) - 1) < 1e-6
+        assert most > float(jnp.sum(change**2))
+
+
+def test_full_damping_is_the_matrix_at_fixed_parameters(laid_out):
+    _, _, _, rows = laid_out
+    got = rows(1.0).matrix
+    assert np.abs(np.asarray(got.entries[jnp.asarray([1, 2, 4])])).max() < 1e-12
+    assert np.abs(np.asarray(got.entries[0] - got.entries[5])).max() < 1e-12
+
+
+def test_conjugate_gradients_solve_the_coupled_system(laid_out):
+    _, net, _, rows = laid_out
+    got = rows(0.1)
+    matrix, free = got.matrix, jnp.zeros(net.shape[:2], bool).at[1:-1, 1:-1].set(True)
+    near = preconditioner(matrix, matrix.trace, free)
+    solution = jax.jit(lambda m, r: coupled_cg(m, r, free, near, 1e-12, 500))(matrix, got.gradient)
+    number = np.arange(net.size).reshape(net.shape)[1:-1, 1:-1].ravel()
+    dense = np.asarray(matrix.dense())[np.ix_(number, number)]
+    exact = np.linalg.solve(dense, np.asarray(got.gradient).reshape(-1)[number])
+    assert np.abs(np.asarray(solution).reshape(-1)[number] - exact).max() < 1e-8 * np.abs(exact).max()
+    assert not np.asarray(solution)[0].any()
+
+
+def objective(fit, surface, errors):
+    net = np.asarray(surface.control_points).reshape(-1, 3)
+    bending = SMOOTHING * np.einsum("ic,ij,jc", net, thin_plate_matrix(surface), net)
+    return np.sum((np.asarray(errors) * float(fit.stats["diagonal"])) ** 2) + bending
+
+
+def test_the_objective_falls_below_that_of_standard_approximation(base, fit):
+    standard = jf.approximate(
+        POINTS, base, jf.StandardApproximation(smoothing=SMOOTHING), max_steps=8, tol_average=1e-9
+    )
+    mine, other = (objective(x, x.surface, x.errors) for x in (fit, standard))
+    assert mine < 0.9 * other
+    net = np.asarray(fit.surface.control_points).reshape(-1, 3)
+    energy = np.einsum("ic,ij,jc", net, thin_plate_matrix(fit.surface), net)
+    assert abs(float(fit.stats["bending_energy"]) - energy) < 1e-9 * energy
+    assert float(fit.stats["smoothing"]) == SMOOTHING
+    assert fit.stats["method"] == "OrthogonalDistance"
+    before, after = (np.asarray(x.control_points) for x in (base, fit.surface))
+    assert (before[[0, -1]] == after[[0, -1]]).all()
+    assert (before[:, [0, -1]] == after[:, [0, -1]]).all()
+
+
+def test_no_step_is_kept_that_makes_the_distances_worse(base):
+    method = jf.OrthogonalDistance(smoothing=0.0, damping=1e-6, reach=50.0, stall_gain=0.0)
+    few = POINTS[:120]
+    last = np.inf
+    for steps in (1, 2, 3, 4, 6, 9):
+        got = jf.approximate(few, base, method, max_steps=steps, tol_average=1e-15)
+        total = float(jnp.sum(got.errors**2))
+        assert total <= last * (1 + 1e-9)
+        last = total
+    assert int(got.stats["retreats"]) > 0
+    assert np.isfinite(np.asarray(got.surface.control_points)).all()
+
+
+def test_damping_follows_the_fall_that_was_foreseen():
+    trust = first_trust(jnp.zeros((2, 2, 3)), jnp.zeros(1), jnp.zeros(1))
+    now = [0.1, 0.1, 0.1, 0.1, 1e-12, 0.5]
+    gain, good = [0.9, 0.4, 0.1, -1.0, 1.0, -1.0], [True, True, True, False, True, False]
+    expected = [0.025, 0.1, 0.4, 1.0, LEAST_DAMPING, 1.0]
+    for mu, fell, kept, after in zip(now, gain, good, expected, strict=True):
+        state = type(trust)(*jax.tree.leaves(trust)[:6], jnp.asarray(1.0), jnp.asarray(mu), trust.retreats)
+        assert np.isclose(next_damping(state, jnp.asarray(fell), jnp.asarray(kept)), after, rtol=1e-6)
+
+
+def test_moves_reach_no_farther_than_a_share_of_the_spacing():
+    net = jnp.asarray(np.random.default_rng(0).normal(size=(6, 5, 3)))
+    move = jnp.zeros_like(net).at[2, 2].set(100.0).at[3, 3].set(1e-3)
+    cut = np.asarray(within_reach(net, move, 0.6))
+    around = [np.linalg.norm(net[2, 2] - net[i, j]) for i, j in ((1, 2), (3, 2), (2, 1), (2, 3))]
+    limit = 0.6 * min(np.mean(around[:2]), np.mean(around[2:]))
+    assert np.isclose(np.linalg.norm(cut[2, 2]), limit)
+    assert (cut[3, 3] == 1e-3).all()
+
+
+def test_a_spline_surface_is_found_again_without_its_parameters():
+    got = data("bspline_reference")
+    net, size = got["control_points"], diagonal(got["points"])
+    knots = [got[x] / got[x][-1] for x in ("knots_u", "knots_v")]
+    off = net.copy()
+    off[1:-1, 1:-1] += 0.05 * size * np.random.default_rng(0).uniform(-1, 1, off[1:-1, 1:-1].shape)
+    method = jf.OrthogonalDistance(smoothing=0.0)
+    fit = jf.approximate(got["points"], jf.BSplineSurface(off, *knots), method, tol_average=2e-13)
+    away = jf.closest_point(fit.surface, got["grid40"].reshape(-1, 3)).distance
+    assert float(jnp.max(away)) < 1e-10 * size
+    assert int(fit.stats["num_steps"]) < 40
+
+
+@pytest.mark.float32_too
+def test_a_tolerance_is_reached_in_few_steps(base):
+    fit = jf.approximate(POINTS, base, jf.OrthogonalDistance(), tol_average=2e-4)
+    assert bool(fit.converged), fit.message
+    assert int(fit.stats["num_steps"]) <= 4
+    distance = np.asarray(jf.closest_point(fit.surface, POINTS).distance) / fit.stats["diagonal"]
+    assert np.abs(np.asarray(fit.errors) - distance).max() < 100 * eps() + 1e-9
+
+
+def test_new_knots_go_in_while_it_runs(base):
+    insertion = jf.KnotInsertion(every=2, most=3)
+    method = jf.OrthogonalDistance(smoothing=1e-9, insertion=insertion)
+    fit = jf.approximate(POINTS, base, method, max_steps=7, tol_average=1e-9)
+    assert fit.surface.shape == (11, 10)
+    assert np.asarray(fit.history.net)[:, 0].tolist() == [8, 8, 8, 9, 9, 10, 10, 11]
+    assert fit.history.average[-1] < 0.5 * fit.history.average[2]
+
+
+def test_fits_in_transformations(base, fit):
+    feet = jf.closest_point(base, POINTS)
+    start = (feet.u, feet.v)
+
+    def net(points, smoothing):
+        method = jf.OrthogonalDistance(smoothing=smoothing)
+        fit = jf.approximate(points, base, method, max_steps=8, tol_average=1e-9, start=start)
+        return fit.surface.control_points
+
+    values = jnp.asarray([SMOOTHING, 1e-3])
+    both = jax.jit(jax.vmap(net, in_axes=(None, 0)))(jnp.asarray(POINTS), values)
+    # Conjugate gradients stop early, where other sums have other rounding.
+    assert np.abs(np.asarray(both[0]) - np.asarray(fit.surface.control_points)).max() < 1e-3
+    assert np.abs(np.asarray(both[1] - both[0])).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"smoothing": -1.0}, "smoothing must be a finite number"),
+        ({"damping": 0.0}, "damping must be greater than 0"),
+        ({"damping": 2.0}, "damping must be greater than 0"),
+        ({"reach": 0.0}, "reach must be greater than 0"),
+    ],
+)
+def test_impossible_fields_get_a_sentence(fields, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jf.OrthogonalDistance(**fields)
