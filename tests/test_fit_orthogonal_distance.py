@@ -144,7 +144,9 @@ def test_damping_follows_the_fall_that_was_foreseen():
     expected = [0.025, 0.1, 0.4, 1.0, LEAST_DAMPING, 1.0]
     for mu, fell, kept, after in zip(now, gain, good, expected, strict=True):
         state = type(trust)(*jax.tree.leaves(trust)[:6], jnp.asarray(1.0), jnp.asarray(mu), trust.retreats)
-        assert np.isclose(next_damping(state, jnp.asarray(fell), jnp.asarray(kept)), after, rtol=1e-6)
+        assert np.isclose(
+            next_damping(state, jnp.asarray(1.5), jnp.asarray(fell), jnp.asarray(kept)), after, rtol=1e-6
+        )
 
 
 def test_moves_reach_no_farther_than_a_share_of_the_spacing():

@@ -136,11 +136,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
         bending = problem.smoothing * thin_plate(*axes).energy(turn.net)
         # Both surfaces are judged by one scale of the loss.
         length = loss_length(self.loss, problem, jnp.where(first, measured.error, trust.error))
-        gain = total_cost(self.loss, length, weight, trust.error) + trust.bending
-        gain = gain - total_cost(self.loss, length, weight, measured.error) - bending
+        before = total_cost(self.loss, length, weight, trust.error) + trust.bending
+        gain = before - total_cost(self.loss, length, weight, measured.error) - bending
         way = farthest_move(axes, (trust.u, trust.v), (measured.u, measured.v), weight > 0)
         good = first | ((gain > 0) & is_plausible(trust, gain, way))
-        damping = jnp.where(turn.step == 1, self.damping, next_damping(trust, gain, good))
+        damping = jnp.where(turn.step == 1, self.damping, next_damping(trust, before, gain, good))
         damping = jnp.where(first, trust.damping, damping)
         here = (turn.net, measured.u, measured.v, measured.error, measured.found, bending)
         kept = (trust.net, trust.u, trust.v, trust.error, trust.found, trust.bending)
