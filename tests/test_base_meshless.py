@@ -181,3 +181,19 @@ def test_an_object_names_the_coons_surface():
     named = jf.base_surface(boundary, net=NET, method=jf.Coons(jf.Uniform()))
     given = jf.base_surface(boundary, net=NET, abscissae=jf.Uniform())
     np.testing.assert_array_equal(named.control_points, given.control_points)
+
+
+def test_fits_take_it_where_the_blend_of_the_sides_is_far_away():
+    x, y = np.random.default_rng(4).random((2, 800))
+    dome = np.stack([x, y, 3.0 * x * (1 - x) * y * (1 - y)], axis=1)
+    t = np.linspace(0.0, 1.0, 20)
+    flat = np.zeros_like(t)
+    sides = ((t, flat), (t, flat + 1.0), (flat, t), (flat + 1.0, t))
+    boundary = jf.Boundary(*(np.stack([*xy, flat], axis=1) for xy in sides))
+    options = dict(net=(10, 10), tol_average=0.0, max_steps=0)
+    blended = jf.fit_points(dome, boundary, base=jf.Coons(), **options)
+    chosen = jf.fit_points(dome, boundary, **options)
+    assert float(chosen.average_error) < 0.05 * float(blended.average_error)
+    near = jf.fit_points(dome * [1.0, 1.0, 1e-2], boundary, **options)
+    coons = jf.base_surface(boundary, dome, net=(10, 10))
+    assert (np.asarray(near.surface.control_points) == np.asarray(coons.control_points)).all()

@@ -2,6 +2,7 @@
 
 from jaxfit._base._base_surface import base_surface as base_surface
 from jaxfit._base._boundary import Boundary as Boundary
+from jaxfit._base._choice import chosen_base as chosen_base
 from jaxfit._base._coons import AbstractAbscissae as AbstractAbscissae
 from jaxfit._base._coons import Greville as Greville
 from jaxfit._base._coons import Uniform as Uniform

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxfit._base import Boundary, base_surface
+from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, chosen_base
 from jaxfit._checks import (
     as_floating,
     as_points,
@@ -271,6 +271,7 @@ def fit_points(
     net: tuple[int, int] | None = None,
     order: tuple[int, int] = (4, 4),
     method: ApproximationMethod | None = None,
+    base: Coons | AbstractBaseMethod | None = None,
     **options: Any,
 ) -> Fit:
     """The whole way from a cloud and its four boundary polylines to a fitted surface.
@@ -285,6 +286,9 @@ def fit_points(
         directions by the lengths of the sides, at most 64 each.
     order : (K, L)
         Degree + 1 along u and v.
+    base : Coons(), Meshless() or DynamicBaseSurface(), optional
+        How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
+        from the points on average, Meshless(), if it is nearer.
     method, options
         As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw.
 
@@ -306,8 +310,11 @@ def fit_points(
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, least=LEAST_POINTS)
     net = _default_net(cloud.shape[0], boundary, order) if net is None else net
-    base = base_surface(boundary, cloud, net=net, order=order)
-    return approximate(cloud, base, method, **options)
+    if base is None and is_concrete(cloud):
+        begun = chosen_base(boundary, np.asarray(cloud), net, order)
+    else:
+        begun = base_surface(boundary, cloud, net=net, order=order, method=base)
+    return approximate(cloud, begun, method, **options)
 
 
 def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:
