@@ -150,9 +150,11 @@ def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BS
         parts = (carry.net, growth.knots_u, growth.knots_v) if whole else cut(carry.net, growth)
     net, *knots = parts
     dtype = base.control_points.dtype
-    moved = jnp.asarray(unit.outward(net), dtype)
+    xp: Any = np if is_concrete(net, begun, base.control_points) else jnp  # NumPy compiles nothing
+    moved = xp.asarray(unit.outward(net), dtype)
     if net.shape == begun.shape:
-        moved = jnp.where(net == begun, base.control_points, moved)
+        still = xp.asarray(net) == xp.asarray(begun)
+        moved = xp.where(still, xp.asarray(base.control_points), moved)
     return BSplineSurface(moved, *(jnp.asarray(x, dtype) for x in knots))
 
 
@@ -170,6 +172,8 @@ def _parts(
     Feet were followed locally; where another part of the surface has come nearer, that counts.
     """
     measured = carry.measured
+    if concrete:
+        measured = jax.tree.map(np.asarray, measured)
     parts = (measured.u, measured.v, measured.error / problem.diagonal, measured.found)
     if not concrete:
         back = jnp.argsort(order)

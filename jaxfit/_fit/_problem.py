@@ -171,13 +171,11 @@ def make_problem(
     )
 
 
-def padded_start(x: Any, size: int, dtype: Any) -> Array:
+def padded_start(x: Any, size: int, dtype: Any) -> Any:
     """Starting parameters, repeated at the end up to the size of the problem."""
-    count = x.shape[0]
-    if size == count:
-        return jnp.asarray(x, dtype)
-    x = np.asarray(x)
-    return jnp.asarray(np.concatenate([x, np.repeat(x[-1:], size - count)]), dtype)
+    xp: Any = np if is_concrete(x) else jnp
+    x = xp.asarray(x, dtype)
+    return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])])
 
 
 def order_by_cell(axes: tuple[Axis, Axis], u: Any, v: Any, count: int) -> Any:
