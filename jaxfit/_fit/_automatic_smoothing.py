@@ -159,7 +159,7 @@ def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 ro
 
 
 @partial(jax.jit, static_argnames=("rule", "method"))
-def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Array, v: Array) -> Array:
+def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> Array:
     """The lambda for a fit that starts from a net and its feet.
 
     Each round solves with the lambda it has found, and corrects the parameters.

@@ -129,9 +129,7 @@ class StandardApproximation(AbstractIterativeMethod):
         return Measured(measured.u, measured.v, distance, measured.steps, ~jnp.asarray(idle), active)
 
 
-def with_smoothing(
-    rule: Any, method: StandardApproximation, problem: Any, net: Array, u: Array, v: Array
-) -> Any:
+def with_smoothing(rule: Any, method: StandardApproximation, problem: Any, net: Array, u: Any, v: Any) -> Any:
     """The problem with the lambda that a rule chooses; as it is where lambda was given as a number."""
     if not isinstance(rule, AbstractSmoothing):
         return problem
