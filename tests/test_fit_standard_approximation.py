@@ -9,7 +9,7 @@ from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._fit._automatic_smoothing import Candidates
-from jaxfit._fit._least_squares import posed
+from jaxfit._fit._least_squares import StructuredSolver, posed
 from jaxfit._fit._measure import border
 from jaxfit._normal import make_system
 from jaxfit._splines._pieces import make_pieces
@@ -84,6 +84,29 @@ def test_every_driver_finds_the_same_control_points(base, one, solver):
 
     net = solved(pieces, base.control_points, feet.u, feet.v, POINTS)
     assert apart(one, np.asarray(net)) < 1e-8
+
+
+def test_the_structured_solver_solves_with_the_jacobian_and_with_its_transpose(base):
+    u, v = np.random.default_rng(7).random((2, 500))
+    pieces = make_pieces(*(np.asarray(x) for x in (base.control_points, base.knots_u, base.knots_v)))
+
+    @jax.jit
+    def there_and_back(pieces, net, u, v, points, x):
+        system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
+        problem = posed(system, border(8, 7, corners_only=False), net)
+        x = jnp.where(problem.normal.free[:, :, None], x, 0.0)
+        image = jax.jvp(problem.residual, (net,), (x,))[1]
+        solver = StructuredSolver(problem)
+        state = solver.init(None, {})
+        across = solver.compute(solver.transpose(state, {})[0], x, {})[0]
+        back = jnp.where(problem.normal.free[:, :, None], system.adjoint(across), 0.0)
+        return x, solver.compute(state, image, {})[0], back
+
+    x = np.random.default_rng(8).normal(size=(8, 7, 3))
+    x, solved, transposed = there_and_back(pieces, base.control_points, u, v, POINTS, x)
+    assert np.abs(np.asarray(x)).max() > 1
+    assert np.abs(np.asarray(solved - x)).max() < 1e-9
+    assert np.abs(np.asarray(transposed - x)).max() < 1e-9
 
 
 @pytest.mark.float32_too

@@ -1,5 +1,7 @@
 """Points in rows of one cell, and polynomials evaluated along them: what every fit's speed rests on."""
 
+from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
+from jaxfit._cells._blocks import over_blocks as over_blocks
 from jaxfit._cells._layout import local_coordinates as local_coordinates
 from jaxfit._cells._layout import row_coefficients as row_coefficients
 from jaxfit._cells._layout import rows_of as rows_of

@@ -8,7 +8,6 @@ from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._on_host import globally as globally
 from jaxfit._closest._on_host import padded as padded
 from jaxfit._closest._on_host import prepare as prepare
-from jaxfit._closest._passes import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
 from jaxfit._closest._passes import Border as Border
 from jaxfit._closest._passes import box_of as box_of
 from jaxfit._closest._project import project as project

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import Rows, make_rows, make_single_rows, row_width
+from jaxfit._cells import SLOTS_PER_BLOCK, Rows, make_rows, make_single_rows, row_width
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
 from jaxfit._closest._feet import ARRIVED, Apart, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
@@ -21,9 +21,8 @@ from jaxfit._splines._pieces import Axis, Pieces
 # Where rows hold a single point, laying feet out anew costs less than moving some that have arrived.
 STEPS_PER_PASS = 3
 STEPS_ALONE = 1
-# On a CPU, what a block computes stays in the caches, and is too little to be shared among cores, which costs
-# more than it gains; whole clouds are shared instead. Elsewhere everything goes at once.
-SLOTS_PER_BLOCK = 4096
+# A block on a CPU is too little to be shared among cores, which costs more than it gains; whole clouds are
+# shared instead.
 ROWS_PER_BLOCK = 2048
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096

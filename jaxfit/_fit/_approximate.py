@@ -56,7 +56,8 @@ def approximate(
     points : array (points, d)
         In any order, any unit.
     base : BSplineSurface
-        A first approximation, for instance from `base_surface`. Its knots are kept.
+        A first approximation, for instance from `base_surface`. Its knots are kept, and others come between
+        them only where the method has an `insertion`.
     method : GeometricApproximation(), OrthogonalDistance() or StandardApproximation(), optional
         Default: GeometricApproximation(), which asks for no smoothing. OrthogonalDistance comes closer in
         fewer iterations. The fit's `stats["method"]` says which it was.
@@ -108,9 +109,7 @@ def approximate(
     dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
-    rule = None
-    if isinstance(method, StandardApproximation):
-        rule = method.smoothing
+    rule = method.smoothing if isinstance(method, StandardApproximation) else None
     if not isinstance(method, GeometricApproximation):
         method, problem = method.prepared(problem)
     size = problem.target.shape[1]

@@ -1,8 +1,6 @@
 """The adapter to `jaxopt`, imported when first used: its drivers for the least-squares problem of a fit."""
 
 import warnings
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +26,7 @@ class JaxoptGaussNewton(AbstractLeastSquares):
 
     def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """As many steps as it takes."""
-
-        def driver(jaxopt: Any, residual: Callable[[Array], Array], tolerance: float) -> Any:
-            return jaxopt.GaussNewton(
-                residual, maxiter=self.max_steps, tol=tolerance, implicit_diff=False, jit=True, unroll=False
-            )
-
-        return _minimised(driver, problem, self.tolerance)
+        return _minimised("GaussNewton", problem, self.tolerance, self.max_steps)
 
 
 class JaxoptLevenbergMarquardt(AbstractLeastSquares):
@@ -53,19 +45,11 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
 
     def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """As many steps as it takes."""
-
-        def driver(jaxopt: Any, residual: Callable[[Array], Array], tolerance: float) -> Any:
-            return jaxopt.LevenbergMarquardt(
-                residual, maxiter=self.max_steps, tol=tolerance, implicit_diff=False, jit=True, unroll=False
-            )
-
-        return _minimised(driver, problem, self.tolerance)
+        return _minimised("LevenbergMarquardt", problem, self.tolerance, self.max_steps)
 
 
-def _minimised(
-    driver: Callable[[Any, Callable[[Array], Array], float], Any], problem: Posed, tolerance: float
-) -> tuple[Array, Array]:
-    """Runs a driver on the residual as one vector of the control points as one vector."""
+def _minimised(name: str, problem: Posed, tolerance: float, steps: int) -> tuple[Array, Array]:
+    """Runs jaxopt's driver of this name on the residual as one vector of the control points as one vector."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says at import that it is not maintained
         import jaxopt
@@ -75,7 +59,9 @@ def _minimised(
         return jnp.concatenate([x.reshape(-1) for x in parts])
 
     eps = float(jnp.finfo(problem.net.dtype).eps)
-    solver = driver(jaxopt, residual, max(tolerance, 10 * eps))
+    driver = getattr(jaxopt, name)
+    options = dict(maxiter=steps, tol=max(tolerance, 10 * eps), implicit_diff=False, jit=True, unroll=False)
+    solver = driver(residual, **options)
     net = solver.run(problem.net.reshape(-1)).params.reshape(problem.net.shape)
     net = jnp.where(problem.normal.free[:, :, None], net, problem.net)
     return net, jnp.zeros((), net.dtype)

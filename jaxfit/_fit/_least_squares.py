@@ -122,6 +122,11 @@ class StructuredSolver(lx.AbstractLinearSolver):
     problem: Posed
     state: Any
 
+    class Side(eqx.Module):
+        """Which of J and its transpose is solved for."""
+
+        transposed: bool = eqx.field(static=True, default=False)
+
     def __init__(self, problem: Posed) -> None:
         self.problem = problem
         self.state = self._solver.init(problem.normal, {})
@@ -135,22 +140,25 @@ class StructuredSolver(lx.AbstractLinearSolver):
         """By what share of its diagonal a singular matrix was shifted."""
         return getattr(self.state, "shift", jnp.zeros((), self.problem.net.dtype))
 
-    def init(self, operator: Any, options: dict[str, Any]) -> tuple[()]:
+    def init(self, operator: Any, options: dict[str, Any]) -> Side:
         """Nothing is left to do."""
-        return ()
+        return self.Side()
 
-    def compute(self, state: tuple[()], vector: Any, options: dict[str, Any]) -> Any:
-        """(J^T J)^-1 J^T r."""
+    def compute(self, state: Side, vector: Any, options: dict[str, Any]) -> Any:
+        """(J^T J)^-1 J^T r, or of the transposed problem the least solution, J (J^T J)^-1 r."""
         problem = self.problem
-        right = problem.system.adjoint(vector)
+        right = vector if state.transposed else problem.system.adjoint(vector)
         right = jnp.where(problem.normal.free[:, :, None], right, 0.0)
-        return self._solver.compute(self.state, right, options)
+        net, result, stats = self._solver.compute(self.state, right, options)
+        if state.transposed:
+            net = jax.jvp(problem.residual, (problem.net,), (net,))[1]
+        return net, result, stats
 
-    def transpose(self, state: tuple[()], options: dict[str, Any]) -> Any:
-        """Not needed by the driver."""
-        raise NotImplementedError("the structured solver has no transpose; use the normal operator's solver.")
+    def transpose(self, state: Side, options: dict[str, Any]) -> Any:
+        """The same factors serve."""
+        return self.Side(not state.transposed), options
 
-    def conj(self, state: tuple[()], options: dict[str, Any]) -> Any:
+    def conj(self, state: Side, options: dict[str, Any]) -> Any:
         """Everything is real."""
         return state, options
 

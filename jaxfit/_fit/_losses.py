@@ -28,6 +28,15 @@ class AbstractLoss(eqx.Module):
     scale: eqx.AbstractVar[float | None]
     width: AbstractClassVar[float]  # the scale in standard deviations, where it follows from the errors
 
+    def __check_init__(self) -> None:
+        if self.scale is not None:
+            check_number("scale", self.scale, 0.0)
+            if not self.scale > 0:
+                raise ValueError(
+                    f"scale must be greater than 0, but is {self.scale!r}; pass a fraction of the diagonal, "
+                    "or None."
+                )
+
     @abstractmethod
     def cost(self, square: Array) -> Array:
         """rho(x) of squares of distances in units of the scale; rho(x) = x near 0."""
@@ -48,16 +57,6 @@ class AbstractLoss(eqx.Module):
         return jnp.maximum(self.width / DEVIATIONS * ordered[place], least)
 
 
-def _check(loss: Any) -> None:
-    if loss.scale is not None:
-        check_number("scale", loss.scale, 0.0)
-        if not loss.scale > 0:
-            raise ValueError(
-                f"scale must be greater than 0, but is {loss.scale!r}; pass a fraction of the diagonal, "
-                "or None."
-            )
-
-
 class Huber(AbstractLoss):
     r"""Distances beyond the scale c count $2 c |e| - c^2$: linearly, no more.
 
@@ -67,8 +66,7 @@ class Huber(AbstractLoss):
     ----------
     scale : float, optional
         c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
-        estimated anew in
-        each iteration from the distance that 90 % of the points do not exceed.
+        estimated anew in each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
     ------
@@ -82,9 +80,6 @@ class Huber(AbstractLoss):
 
     scale: float | None = None
     width: ClassVar[float] = 1.345
-
-    def __check_init__(self) -> None:
-        _check(self)
 
     def cost(self, square: Array) -> Array:
         """x up to 1, then 2 sqrt(x) - 1."""
@@ -120,9 +115,6 @@ class Tukey(AbstractLoss):
     scale: float | None = None
     width: ClassVar[float] = 4.685
 
-    def __check_init__(self) -> None:
-        _check(self)
-
     def cost(self, square: Array) -> Array:
         """(1 - (1 - x)^3) / 3 up to 1, then 1/3."""
         return (1.0 - jnp.maximum(1.0 - square, 0.0) ** 3) / 3.0
@@ -154,9 +146,6 @@ class GemanMcClure(AbstractLoss):
 
     scale: float | None = None
     width: ClassVar[float] = 4.685
-
-    def __check_init__(self) -> None:
-        _check(self)
 
     def cost(self, square: Array) -> Array:
         """x / (1 + x)."""

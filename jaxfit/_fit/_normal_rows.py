@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._cells import (
@@ -29,13 +29,13 @@ from jaxfit._cells import (
     cells_to_net,
     evaluate_jet,
     local_coordinates,
+    over_blocks,
     row_coefficients,
     row_moments,
     row_width,
     rows_of,
     staged,
 )
-from jaxfit._closest import SLOTS_PER_BLOCK
 from jaxfit._normal import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
 
@@ -65,32 +65,22 @@ def normal_rows(
     """The normal equations at feet (u, v), for `damping` mu; points of weight 0 take no part."""
     pieces = jax.tree.map(jnp.asarray, pieces)
     rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), weight <= 0)
-    count, width = rows.point.shape
-    on_cpu = jax.default_backend() == "cpu"
-    size = min(count, max(SLOTS_PER_BLOCK // width, 1)) if on_cpu else count
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
     pairs = d * (d + 1) // 2
     always = problem.diagonal > 0
     values = jnp.concatenate([problem.target, jnp.stack([u, v, weight])])
 
-    def block(carry: tuple[Array, _Sums]) -> tuple[Array, _Sums]:
-        start, done = carry
-        part = rows.block(start, size)
-        # The last block is moved back where fewer rows are left; those before it have been counted.
-        fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
-        filled = part.filled & fresh[:, None]
+    def add(part: Rows, filled: Array, done: _Sums) -> _Sums:
         s, t, e, entries = staged(always, _rows_at, pieces, part, part.spread(values), filled, damping)
         squares = row_moments(s, t, entries, 2 * order_u - 1, 2 * order_v - 1)
         pulls = row_moments(s, t, e, order_u, order_v)
-        sums = _Sums(done.squares.at[part.cell].add(squares), done.pulls.at[part.cell].add(pulls))
-        return start + size, sums
+        return _Sums(done.squares.at[part.cell].add(squares), done.pulls.at[part.cell].add(pulls))
 
     begin = _Sums(
         jnp.zeros((pieces.cells, 2 * order_u - 1, (2 * order_v - 1) * pairs), u.dtype),
         jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype),
     )
-    zero = jnp.asarray(0, jnp.int32)
-    done = lax.while_loop(lambda x: x[0] < rows.used, block, (zero, begin))[1]
+    done = over_blocks(rows, add, begin)
     matrix = coupled_stencil(done.squares, pieces.axis_u, pieces.axis_v, pairs)
     gradient = cells_to_net(done.pulls, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
     return NormalRows(matrix, gradient)

@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import (
@@ -19,13 +19,14 @@ from jaxfit._cells import (
     evaluate_jet,
     evaluate_values,
     local_coordinates,
+    over_blocks,
     row_coefficients,
     row_moments,
     row_width,
     rows_of,
     staged,
 )
-from jaxfit._closest import SLOTS_PER_BLOCK, AbstractFootMethod, box_of, follow
+from jaxfit._closest import AbstractFootMethod, box_of, follow
 from jaxfit._splines._pieces import Pieces
 
 
@@ -65,17 +66,9 @@ def pull(
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
     rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
-    count, width = rows.point.shape
-    on_cpu = jax.default_backend() == "cpu"
-    size = min(count, max(SLOTS_PER_BLOCK // width, 1)) if on_cpu else count
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
 
-    def block(carry: tuple[Array, _Pass]) -> tuple[Array, _Pass]:
-        start, done = carry
-        part = rows.block(start, size)
-        # The last block is moved back where fewer rows are left; those before it have been counted.
-        fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
-        filled = part.filled & fresh[:, None]
+    def add(part: Rows, filled: Array, done: _Pass) -> _Pass:
         here = part.spread(jnp.concatenate([problem.target, jnp.stack([u, v, problem.weight])]))
         next_u, next_v, e = _step(problem, pieces, part, here, method)
         always = problem.diagonal > 0
@@ -92,15 +85,14 @@ def pull(
         moments = row_moments(s, t, values, order_u, order_v)
         feet = done.feet.at[:, part.point].set(jnp.stack([next_u, next_v, error]), mode="drop")
         active = done.active + jnp.sum(values[-1] > 0, dtype=jnp.int32)
-        return start + size, _Pass(feet, done.cells.at[part.cell].add(moments), active)
+        return _Pass(feet, done.cells.at[part.cell].add(moments), active)
 
     begin = _Pass(
         jnp.stack([u, v, error]),
         jnp.zeros((pieces.cells, order_u, order_v * (d + 1)), u.dtype),
         jnp.asarray(0, jnp.int32),
     )
-    zero = jnp.asarray(0, jnp.int32)
-    done = lax.while_loop(lambda x: x[0] < rows.used, block, (zero, begin))[1]
+    done = over_blocks(rows, add, begin)
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
     return done.feet, Pulls(sums), done.active
 

@@ -1,0 +1,35 @@
+"""Sums over rows, a block of them at a time, so that what a block needs stays in a core's caches."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jaxfit._cells._rows import Rows
+
+# On a CPU, what a block computes stays in the caches. Elsewhere everything goes at once.
+SLOTS_PER_BLOCK = 4096
+
+Total = TypeVar("Total")
+
+
+def over_blocks(rows: Rows, add: Callable[[Rows, Array, Any], Total], begin: Total) -> Total:
+    """`add(block, filled, total)` for one block of rows after the other, from `begin`.
+
+    `filled` are the slots of a block that hold a point which has not been seen before: the last block
+    is moved back where fewer rows are left.
+    """
+    count, width = rows.point.shape
+    on_cpu = jax.default_backend() == "cpu"
+    size = min(count, max(SLOTS_PER_BLOCK // width, 1)) if on_cpu else count
+
+    def block(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        start, total = carry
+        part = rows.block(start, size)
+        fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
+        return start + size, add(part, part.filled & fresh[:, None], total)
+
+    start = jnp.asarray(0, jnp.int32)
+    return lax.while_loop(lambda x: x[0] < rows.used, block, (start, begin))[1]
