@@ -128,8 +128,12 @@ def outcome(code: Any, net: Any, throw: bool) -> Any:
 
     Inside transformations nothing can be raised but by what depends on `net`.
     """
-    result = result_of(code)
-    if throw and is_concrete(code):
+    return checked_outcome(result_of(code), net, throw)
+
+
+def checked_outcome(result: Any, net: Any, throw: bool) -> Any:
+    """`outcome` of an item of RESULTS."""
+    if throw and is_concrete(result):
         if not bool(result == RESULTS.converged):
             raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
     elif throw:

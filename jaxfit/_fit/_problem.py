@@ -81,6 +81,15 @@ class Unit(eqx.Module):
             return np.asarray(x, np.float64) * self.scale + self.centre
         return x * self.scale + _like(self.centre, x)
 
+    def halves(self, dtype: Any) -> tuple[Any, Any]:
+        """The centre as the sum of two vectors of `dtype`: with the smaller one added first, the outward way
+        rounds but once, although the session may have no double precision.
+        """
+        if not is_concrete(self.centre):
+            return self.centre.astype(dtype), jnp.zeros_like(self.centre, dtype)
+        high = np.asarray(self.centre, dtype)
+        return high, np.asarray(self.centre - high, dtype)
+
     def loss(self, points: Any) -> Any:
         """At most how far rounding has moved `points`, a net (nu, nv, d) in the user's unit, as a fraction of
         the diagonal: by so much errors on a surface with these control points may be larger.

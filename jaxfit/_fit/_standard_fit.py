@@ -1,22 +1,39 @@
 """From a grid to a Fit by standard interpolation: units, checks, and one dispatch."""
 
+from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
+from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._fit_result import Fit, History
+from jaxfit._fit._fit_result import Fit, History, checked_outcome
 from jaxfit._fit._grid_outcome import check_solved, ending
 from jaxfit._fit._grid_systems import Account
 from jaxfit._fit._loop import code_of
 from jaxfit._fit._problem import Unit, unit_of
 from jaxfit._fit._results import RESULTS
-from jaxfit._fit._standard_interpolation import Solution, StandardInterpolation, solved
+from jaxfit._fit._standard_interpolation import StandardInterpolation, solved
 from jaxfit._precision import bucket, interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
+
+# Rows and columns of the corners.
+CORNERS = np.asarray([[0], [-1]]), np.asarray([[0, -1]])
+
+
+class Place(eqx.Module):
+    """Where the data lies, and what it is to be fitted to; the diagonal is the user's."""
+
+    unit: Unit
+    halves: tuple[Float[Any, " d"], Float[Any, " d"]]
+    corners: Float[Any, "2 2 d"]
+    goal: Float[Any, ""]
+    tolerance: Float[Any, ""]
+    most: Any
 
 
 def standard_fit(
@@ -32,70 +49,76 @@ def standard_fit(
     Raises ValueError where concrete data has no extent along one index, or is too uneven for the order.
     """
     unit = unit_of(grid.reshape(-1, grid.shape[2]))
-    concrete = is_concrete(grid)
-    dtype = working_dtype() if concrete else jnp.result_type(grid, float)
+    dtype = np.dtype(working_dtype() if is_concrete(grid) else jnp.result_type(grid, float))
     inner = unit.inward(grid).astype(dtype)
-    goal, tolerance = interpolation_tolerance(tolerance, np.dtype(dtype), unit.least_tolerance(dtype))
+    goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
     xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
-    limits = (
-        xp.asarray(unit.diagonal / unit.scale, dtype),
-        xp.asarray(goal, dtype),
-        xp.asarray(max_steps, np.int32),
-    )
+    limits = xp.asarray(goal, dtype), xp.asarray(tolerance, dtype), xp.asarray(max_steps, np.int32)
+    corners = grid[CORNERS].astype(dtype)
+    place = Place(unit, unit.halves(dtype), corners, *limits)
     room = bucket(int(max_steps) + 1) if method.iterative else 1
-    solution = solved(method, (int(order[0]), int(order[1])), room, inner, limits)
-    if is_concrete(solution):
-        check_solved(method.parametrisation, order, inner, solution.extent, solution.maximum)
-    return _fit(solution, unit, grid, (xp.asarray(tolerance, dtype), limits[2]), throw)
+    fit, extent = _fitted(method, (int(order[0]), int(order[1])), room, inner, place)
+    fit.stats.update(diagonal=unit.diagonal, tolerance=place.tolerance)
+    if is_concrete(fit):
+        check_solved(method.parametrisation, order, inner, extent, fit.maximum_error)
+        if method.iterative:
+            fit = eqx.tree_at(lambda fit: fit.history, fit, _cut(fit.history, int(fit.stats["num_steps"])))
+    if throw:
+        result = checked_outcome(fit.result, fit.surface.control_points, throw)
+        fit = eqx.tree_at(lambda fit: fit.result, fit, result)
+    return fit
 
 
-def _fit(solution: Solution, unit: Unit, grid: Any, limits: tuple[Any, Any], throw: bool) -> Fit:
-    concrete = is_concrete(solution)
+@partial(jax.jit, static_argnames=("method", "order", "room"))
+def _fitted(
+    method: StandardInterpolation,
+    order: tuple[int, int],
+    room: int,
+    data: Float[Array, "n m d"],
+    place: Place,
+) -> tuple[Fit, Array]:
+    """The fit, of whose `stats` some come later, and the extent of the grid. To make the fit in here spares
+    the host a good part of the time that a small one takes.
+    """
+    unit, dtype = place.unit, data.dtype
+    diagonal = jnp.asarray(unit.diagonal / unit.scale, dtype)
+    solution = solved(method, order, room, data, (diagonal, place.goal, place.most))
+    high, low = (x[None, None] for x in place.halves)
+    net = (solution.net * jnp.asarray(unit.scale, dtype) + low) + high
+    net = net.at[CORNERS].set(place.corners)  # the data, to the last bit
+    loss = lax.stop_gradient(unit.loss(net))
     account = solution.account
-    net = unit.outward(np.asarray(solution.net) if concrete else solution.net)
-    ends = np.asarray([0, -1])
-    corner = ends[:, None], ends[None, :]
-    # Corners are the data, to the last bit.
-    if concrete:
-        net[corner] = np.asarray(grid)[corner]
-        net = jnp.asarray(net, solution.net.dtype)
-    else:
-        net = net.at[corner].set(grid[corner].astype(net.dtype))
+    maximum = solution.maximum + loss
+    spent = (account.step >= place.most) & (account.step > 0)
+    missed = jnp.where(spent, code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled))
+    met = code_of(RESULTS.converged)
     stats = {
         "num_steps": account.step,
-        "diagonal": unit.diagonal,
         "unconverged_feet": solution.lost,
-        "tolerance": limits[0],
         "corrections": solution.corrections,
         "parameter_change": solution.parameter_change,
     }
-    surface = BSplineSurface(net, *solution.knots)
-    loss = unit.loss(np.asarray(net)) if concrete else lax.stop_gradient(unit.loss(net))
-    fields = (solution.errors, solution.average, solution.maximum)
-    errors = [(np.asarray(x) if concrete else x) + loss for x in fields]
-    result = _ending(errors[2], loss, account.step, limits, net, throw)
-    parts: Any = jax.device_put(errors) if concrete else errors
-    feet = solution.u, solution.v
-    return Fit(surface, *feet, parts[0], parts[1], parts[2], _history(account), result, stats)
+    fit = Fit(
+        surface=BSplineSurface(net, *solution.knots),
+        u=solution.u,
+        v=solution.v,
+        errors=solution.errors + loss,
+        average_error=solution.average + loss,
+        maximum_error=maximum,
+        history=_history(account),
+        result=ending(maximum, loss, place.tolerance, met, missed, net, throw=False),
+        stats=stats,
+    )
+    return fit, solution.extent
 
 
 def _history(account: Account) -> History:
     """The errors; solves evaluate nothing for a foot and move none, and corrections report in `stats`."""
-    average, maximum = account.average, account.maximum
-    if not is_concrete(account):
-        none = 0.0 * average
-        return History(average, maximum, none, none)
-    end = int(account.step) + 1
-    if average.shape != (end,):
-        average, maximum = (jnp.asarray(np.asarray(x)[:end]) for x in (average, maximum))
-    none = jnp.asarray(np.zeros(end, average.dtype))
-    return History(average, maximum, none, none)
+    none = 0.0 * account.average
+    return History(account.average, account.maximum, none, none)
 
 
-def _ending(maximum: Any, loss: Any, step: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
-    """Why the fit stopped; raises the sentence if `throw` and it has not converged."""
-    tolerance, most = limits
-    xp: Any = np if is_concrete(step, most) else jnp
-    spent = (step >= most) & (step > 0)
-    missed = xp.where(spent, code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled))
-    return ending(maximum, loss, tolerance, code_of(RESULTS.converged), missed, net, throw)
+def _cut(history: History, steps: int) -> History:
+    """The history of a known number of steps. By JAX, every new length would be a new compilation."""
+    columns = history.average, history.maximum, *2 * (np.zeros_like(history.average),)
+    return History(*jax.device_put([np.asarray(x)[: steps + 1] for x in columns]))
