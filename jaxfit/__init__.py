@@ -34,6 +34,7 @@ from jaxfit._fit import JaxoptGaussNewton as JaxoptGaussNewton
 from jaxfit._fit import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
 from jaxfit._fit import KnotInsertion as KnotInsertion
 from jaxfit._fit import LevenbergMarquardt as LevenbergMarquardt
+from jaxfit._fit import Nesterov as Nesterov
 from jaxfit._fit import NormalInterpolation as NormalInterpolation
 from jaxfit._fit import OptimalRepositioning as OptimalRepositioning
 from jaxfit._fit import OrthogonalDistance as OrthogonalDistance

@@ -15,7 +15,8 @@ BOUNDARY = jf.Boundary(**EDGES)
 
 def plain(**options):
     """Algorithm 1 as it stands, without what the default adds."""
-    return jf.GeometricApproximation(relaxation=1.0, foresee=False, **options)
+    fields = dict(relaxation=1.0, acceleration=None, foresee=False)
+    return jf.GeometricApproximation(**(fields | options))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +66,7 @@ def test_a_free_boundary_moves_all_but_the_corners(base):
 
 
 def test_relaxation_lengthens_the_move(base):
-    method = jf.GeometricApproximation(relaxation=1.7, foresee=False)
+    method = plain(relaxation=1.7)
     fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
     shift, _ = one_step(POINTS, base)
     shift[[0, -1]] = shift[:, [0, -1]] = 0
@@ -73,12 +74,43 @@ def test_relaxation_lengthens_the_move(base):
     assert np.abs(np.asarray(fit.surface.control_points) - expected).max() < 1e-12
 
 
-def test_relaxation_saves_iterations(base):
+def test_relaxation_and_momentum_save_iterations(base):
     steps = [
         int(jf.approximate(POINTS, base, method, tol_average=2e-4).stats["num_steps"])
-        for method in (plain(), jf.GeometricApproximation(relaxation=1.7, foresee=False))
+        for method in (plain(), plain(relaxation=1.7), jf.GeometricApproximation())
     ]
     assert steps[1] < 0.8 * steps[0]
+    assert steps[2] < 0.8 * steps[1]
+
+
+def test_momentum_is_nesterovs(base):
+    rate, surfaces = 1.2, [base]
+    reached, weight = np.asarray(base.control_points), 1.0
+    for _ in range(4):
+        before, surface = reached, surfaces[-1]
+        shift, _ = one_step(POINTS, surface)
+        shift[[0, -1]] = shift[:, [0, -1]] = 0
+        reached = np.asarray(surface.control_points) + rate * shift
+        following = (1 + np.sqrt(1 + 4 * weight**2)) / 2
+        net = reached + (weight - 1) / following * (reached - before)
+        weight = following
+        surfaces.append(jf.BSplineSurface(net, base.knots_u, base.knots_v))
+    method = plain(relaxation=rate, acceleration=jf.Nesterov())
+    for steps in (2, 4):
+        fit = jf.approximate(POINTS, base, method, max_steps=steps, tol_average=1e-9)
+        assert (np.diff(fit.history.average) < 0).all()
+        apart = np.abs(np.asarray(fit.surface.control_points - surfaces[steps].control_points)).max()
+        assert apart < 1e-9
+
+
+def test_momentum_stops_where_the_error_rises_and_where_the_net_is_changed(base):
+    method = plain(acceleration=jf.Nesterov(), fairing=jf.Fairing(every=5))
+    average = np.asarray(jf.approximate(POINTS, base, method, tol_average=1e-9, max_steps=9).history.average)
+    assert (np.flatnonzero(np.diff(average) > 0) + 1).tolist() == [5]
+    long = jf.approximate(POINTS, base, jf.GeometricApproximation(), tol_average=1e-9, max_steps=400)
+    rises = np.flatnonzero(np.diff(long.history.average) > 0)
+    assert rises.size > 0
+    assert (np.diff(rises) > 1).all()  # a step from rest goes down again
 
 
 def test_fairing_is_the_mean_of_nine_neighbours(base):
@@ -119,7 +151,8 @@ def test_local_mode_leaves_alone_what_is_near_enough(base):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"relaxation": 2.0}, "relaxation must lie between 0 and 2"),
+        ({"relaxation": 2.0, "acceleration": None}, "relaxation must lie between 0 and 2"),
+        ({"relaxation": 1.4}, "relaxation must lie between 0 and 1.333, where the accelerated"),
         ({"fairing": jf.Fairing(every=7)}, "stall_window must be a multiple"),
     ],
 )

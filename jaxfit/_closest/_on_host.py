@@ -159,8 +159,8 @@ def globally(
     begun = feet_from(None, *search.nearest()) if known is None else known
     best = {name: np.array(x) for name, x in begun.items()}
     rivals = search.rivals(best["u"], best["v"], np.sqrt(best["f"].astype(np.float64)))
-    which, u, v = rivals.first()
-    if which.size:
+    if len(rivals.who) > size:  # so many that it pays to drop those next to feet found first
+        which, u, v = rivals.first()
         other = feet_from(which, u, v)
         everywhere_u, everywhere_v = best["u"].copy(), best["v"].copy()
         everywhere_u[which], everywhere_v[which] = other["u"], other["v"]

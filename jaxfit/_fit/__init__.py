@@ -22,6 +22,7 @@ from jaxfit._fit._least_squares import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._fit._losses import GemanMcClure as GemanMcClure
 from jaxfit._fit._losses import Huber as Huber
 from jaxfit._fit._losses import Tukey as Tukey
+from jaxfit._fit._nesterov import Nesterov as Nesterov
 from jaxfit._fit._normal_interpolation import NormalInterpolation as NormalInterpolation
 from jaxfit._fit._orthogonal_distance import OrthogonalDistance as OrthogonalDistance
 from jaxfit._fit._repositioning import ConstantWeight as ConstantWeight

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._growth import Growth
+from jaxfit._fit._nesterov import Momentum, at_rest
 from jaxfit._fit._pull import Pulls
 from jaxfit._fit._results import RESULTS
 from jaxfit._fit._trust import Trust, first_trust
@@ -79,6 +80,10 @@ class Records(eqx.Module):
             (self.active.at[step].set(active), self.shape.at[:, step].set(used)),
         )
 
+    def has_risen(self, step: Array) -> Array:
+        """Whether the average error is greater than in the iteration before."""
+        return self.average[step] > self.average[jnp.maximum(step - 1, 0)]
+
     def is_stalled(self, step: Array, window: int, gain: float) -> Array:
         """Whether neither error has fallen by the share `gain` within `window` iterations."""
         before, keep = jnp.maximum(step - window, 0), 1.0 - gain
@@ -95,6 +100,7 @@ class Turn(eqx.Module):
     growth: Growth | None = None  # of a net that gets more knots on the way
     shift: Float[Any, ""] | None = None  # most that a singular system has been shifted, where any is solved
     trust: Trust | None = None  # of methods that may take a step back
+    momentum: Momentum | None = None  # of methods that are accelerated
 
     def axes(self, problem: Any) -> tuple[Axis, Axis]:
         """Both directions of the knots."""
@@ -141,6 +147,11 @@ class AbstractIterativeMethod(eqx.Module):
         return False
 
     @property
+    def glides(self) -> bool:
+        """Whether there is momentum."""
+        return False
+
+    @property
     def marks(self) -> bool:
         """Whether points that are too far away are remembered."""
         return False
@@ -181,7 +192,9 @@ def begin(
     shift = xp.zeros((), net.dtype) if method.solves else None
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor)
     trust = first_trust(net, u, v) if method.retreats else None
-    turn = Turn(net, number(0), Records(empty, empty, empty, empty, counts, sizes), growth, shift, trust)
+    momentum = at_rest(net) if method.glides else None
+    records = Records(empty, empty, empty, empty, counts, sizes)
+    turn = Turn(net, number(0), records, growth, shift, trust, momentum)
     best = Best(net, measured, xp.asarray(np.inf, net.dtype)) if method.keeps_best else None
     running = number(code_of(RESULTS.running))
     return Carry(net, number(-1), turn, measured, running, best, xp.asarray(True), growth)
