@@ -3,15 +3,17 @@
     python benchmarks/least_squares.py [--turns 7] [--case 0 1 2]
 
 Median times with the lowest and the highest, after the first call, which compiles. Both get points and
-parameters on a uniform net whose border control points are held, and give control points; the root mean
-square distance from the points follows. Ours is timed through optimistix, as `StandardApproximation` solves
-it, and bare: moments, factors, one solve. Without scikit-sparse SciPy's own `splu` takes CHOLMOD's part.
-They take turns, so that both meet the same machine.
+parameters on a uniform net whose border control points are held, and give control points. The root mean
+square distance from the points follows, and the memory: ours what the compiled computation holds at most, its
+inputs included, SciPy's what its arrays take at most beyond them. Ours is timed through optimistix, as
+`StandardApproximation` solves it, and bare: moments, factors, one solve. Without scikit-sparse SciPy's own
+`splu` takes CHOLMOD's part. They take turns, so that both meet the same machine.
 """
 
 import argparse
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
 import jax
@@ -56,7 +58,7 @@ def through_optimistix(pieces, net, u, v, points, smoothing):
 @jax.jit
 def bare(pieces, net, u, v, points, smoothing):
     problem = _posed(pieces, net, u, v, points, smoothing)
-    return net - StructuredSolver(problem).compute((), problem.residual(net), {})[0]
+    return net - StructuredSolver(problem).compute(StructuredSolver.Side(), problem.residual(net), {})[0]
 
 
 def _posed(pieces, net, u, v, points, smoothing):
@@ -115,16 +117,35 @@ def main():
         for smoothing in (0.0, SMOOTHING):
             plate = smoothing * plate_of(knots, net) if smoothing else None
             inputs = jax.device_put((make_pieces(net, *knots), net, u, v, points, np.asarray(smoothing)))
+            memory = [held(f, inputs) for f in (through_optimistix, bare)]
             works = {
                 "jaxfit, through optimistix": lambda i=inputs: jax.block_until_ready(through_optimistix(*i)),
                 "jaxfit, bare": lambda i=inputs: jax.block_until_ready(bare(*i)),
                 other: lambda a=(knots, net, u, v, points, plate): scipy_solve(*a),
             }
-            report(f"{count} points, {nu}x{nv}, lambda {smoothing:g}", works, options.turns, inputs, knots)
+            memory.append(allocated(works[other]))
+            title = f"{count} points, {nu}x{nv}, lambda {smoothing:g}"
+            report(title, works, options.turns, inputs, knots, memory)
 
 
-def report(title, works, turns, inputs, knots):
-    """Times in turns, and the distances from the points."""
+def held(function, inputs):
+    """MiB of inputs, results and temporaries of a compiled function."""
+    analysis = function.lower(*inputs).compile().memory_analysis()
+    parts = (analysis.argument_size_in_bytes, analysis.output_size_in_bytes, analysis.temp_size_in_bytes)
+    return sum(parts) / 2**20
+
+
+def allocated(work):
+    """MiB that NumPy and SciPy take at most (CHOLMOD's factors are not seen)."""
+    tracemalloc.start()
+    work()
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return most / 2**20
+
+
+def report(title, works, turns, inputs, knots, memory):
+    """Times in turns, distances from the points, and memory."""
     print(title)
     results = {name: work() for name, work in works.items()}
     times = {name: [] for name in works}
@@ -135,13 +156,13 @@ def report(title, works, turns, inputs, knots):
             times[name].append(time.perf_counter() - begun)
     u, v, points = (np.asarray(x) for x in inputs[2:5])
     last = np.median(list(times.values())[-1])
-    for name, spent in times.items():
+    for (name, spent), most in zip(times.items(), memory, strict=True):
         low, middle, high = (1e3 * x for x in (min(spent), np.median(spent), max(spent)))
         error = rms(knots, results[name], u, v, points)
         ratio = 1e3 * last / middle
         print(
             f"  {name:<28}{middle:>9.1f} ms  [{low:.1f}, {high:.1f}]  {ratio:>6.2f} times as fast   "
-            f"rms {error:.9e}",
+            f"rms {error:.9e}   {most:>7.0f} MiB",
             flush=True,
         )
 

@@ -42,7 +42,7 @@ def model(options, name):
         )
         return points, jf.BSplineSurface(net, u, v), (feet[:, 0], feet[:, 1])
     points, boundary = cloud(options, name)
-    return points, jf.base_surface(boundary, points, net=(42, 42)), None
+    return points, jf.base_surface(boundary, points, net=(42, 42), method=jf.Meshless()), None
 
 
 def cloud(options, name):
@@ -112,8 +112,9 @@ def same(options):
         points, base, start = model(options, name)
         on = {"stall_gain": 0.0, "stall_window": 200}  # to the last iteration
         runs = [
-            (jf.GeometricApproximation(**on), 200),
+            (jf.GeometricApproximation.paper(insertion=None, fairing=None, **on), 200),
             (jf.StandardApproximation(smoothing, **on), 200),
+            (jf.GeometricApproximation(**on), 200),
             (jf.OrthogonalDistance(smoothing, **on), 10),
             (jf.OrthogonalDistance(smoothing, **on), 100),
         ]
