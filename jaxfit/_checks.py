@@ -1,6 +1,7 @@
 """Checks of what users hand in: one sentence each, before anything is compiled."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 LARGEST = 1e150
+LARGEST_COUNT = 2**31 - 2
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -19,6 +21,21 @@ def is_concrete(*trees: Any) -> bool:
         if any(isinstance(x, jax.core.Tracer) for x in leaves):
             return False
     return True
+
+
+def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Have `function` computed at once, even while something around it is traced, if none of its arguments
+    is: inside `jit` JAX would otherwise trace what depends on constants only.
+    """
+
+    @wraps(function)
+    def at_once(*args: Any, **options: Any) -> Any:
+        if not is_concrete(args, options):
+            return function(*args, **options)
+        with jax.ensure_compile_time_eval():
+            return function(*args, **options)
+
+    return at_once
 
 
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
@@ -147,12 +164,16 @@ def _check_multiplicity(name: str, knots: np.ndarray, order: int, count: int) ->
 def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
     """Raise unless `value` is an instance of `kind`; `example` says what to pass."""
     if not isinstance(value, kind):
-        given = f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+        given = f"a {type(value).__name__}"
+        if isinstance(value, type):
+            given = f"the class {value.__name__}"
+            example = f"{value.__name__}()" if issubclass(value, kind) else example
         raise TypeError(f"{name} must be an object such as {example}, but is {given}; pass {example}.")
 
 
 def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:
-    """Raise unless a concrete `value` is a number, at least `least`, and whole if so asked."""
+    """Raise unless a concrete `value` is a number, at least `least`, and whole (and no larger than numbers
+    of 32 bits) if so asked."""
     if not is_concrete(value):
         return
     kind = "a whole number" if whole else "a number"
@@ -160,8 +181,17 @@ def check_number(name: str, value: Any, least: int | float, whole: bool = False)
         number = float(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be {kind}, but is {value!r}; pass {kind}.") from error
+    if whole and number > LARGEST_COUNT:
+        raise ValueError(f"{name} must be at most {LARGEST_COUNT}, but is {number:g}; lower it.")
     if not number >= least or (whole and number != int(number)):
         raise ValueError(f"{name} must be {kind} of at least {least:g}, but is {number:g}; raise it.")
+
+
+def check_steps(name: str, value: Any) -> None:
+    """Raise unless `value` is a whole number of steps, known before tracing: histories have room for it."""
+    if not is_concrete(value):
+        raise TypeError(f"{name} must be known before tracing, but is traced; pass an int.")
+    check_number(name, value, 0, whole=True)
 
 
 def check_order(order: Any) -> None:

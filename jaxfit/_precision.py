@@ -12,11 +12,13 @@ from jaxfit._checks import is_concrete
 DEFAULT_FOOT_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 # The same, for the errors of an interpolation.
 DEFAULT_INTERPOLATION_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
+# Where rounding alone costs more than this, a fit that asks for nothing has not converged either.
+WORST_TOLERANCE = 1e-3
 _said = False
 
 
 def working_dtype() -> np.dtype:
-    """The floating type that arrays get: float64 if the session has x64 switched on."""
+    """What everything is fitted in, whatever the data's own type: float64 if the session has that."""
     return np.dtype(jnp.result_type(float))
 
 
@@ -29,17 +31,19 @@ def interpolation_tolerance(tolerance: Any, dtype: np.dtype, least: Any) -> tupl
     """What an interpolation is to reach, and what it may have after its net is rounded.
 
     The second is the tolerance asked for, with advice where this precision cannot meet it; by default the
-    usual one, or the `least` that the data permits where that is more. The first leaves room for rounding.
+    usual one, or the `least` that the data permits where that is more, within reason. The first leaves room
+    for rounding.
     """
     xp: Any = np if is_concrete(tolerance, least) else jnp
     if tolerance is None:
-        tolerance = xp.maximum(DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6), least)
+        usual = DEFAULT_INTERPOLATION_TOLERANCE.get(np.dtype(dtype).name, 2e-6)
+        tolerance = xp.minimum(xp.maximum(usual, least), WORST_TOLERANCE)
     elif is_concrete(tolerance):
-        advise_x64(float(tolerance), np.dtype(dtype), stacklevel=4)
+        advise_x64(float(tolerance), np.dtype(dtype), stacklevel=6)
     return xp.maximum(tolerance - least / 8, 0.5 * tolerance), tolerance
 
 
-def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 3) -> None:
+def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 4) -> None:
     """Tell the user, once a session, that a tolerance is out of reach in this precision."""
     global _said
     if _said or np.dtype(dtype).itemsize >= 8 or tolerance >= 1e-6:

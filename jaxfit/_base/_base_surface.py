@@ -12,7 +12,7 @@ from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._douglas_peucker import chord_lengths
 from jaxfit._base._method import AbstractBaseMethod, Coons, refined
 from jaxfit._base._opposite import starts_by_count, starts_by_tolerance
-from jaxfit._checks import as_points, check_kind, is_concrete
+from jaxfit._checks import as_points, check_kind, eager_where_concrete, is_concrete
 from jaxfit._splines import BSplineSurface
 
 MAX_STEPS = 100  # of the curve fit; few curves use them up
@@ -23,6 +23,7 @@ POINTS_PER_CONTROL_POINT = 8  # of a net chosen here for a method that looks at 
 MOST_CONTROL_POINTS = 64  # per direction, likewise
 
 
+@eager_where_concrete
 def base_surface(
     boundary: Boundary,
     points: ArrayLike | None = None,

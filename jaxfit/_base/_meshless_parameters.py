@@ -11,7 +11,7 @@ from jaxfit._base._cloud import cloud_of
 from jaxfit._base._douglas_peucker import chord_lengths, densify
 from jaxfit._base._stars import Stars, mean_value_weights, stars
 from jaxfit._base._stretch import area_stretch, link_weights
-from jaxfit._checks import as_points, check_kind, check_number, is_concrete
+from jaxfit._checks import as_points, check_kind, check_number, eager_where_concrete, is_concrete
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
 APART = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
@@ -28,6 +28,7 @@ class _Nodes(NamedTuple):
     place: np.ndarray  # (points, 2) parameters of the others, on the boundary
 
 
+@eager_where_concrete
 def meshless_parameters(
     points: ArrayLike, boundary: Boundary, neighbours: int = 24, reweightings: int = 4
 ) -> tuple[Float[Any, " points"], Float[Any, " points"]]:

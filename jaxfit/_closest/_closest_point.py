@@ -11,7 +11,14 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_concrete
+from jaxfit._checks import (
+    as_floating,
+    as_points,
+    check_kind,
+    check_number,
+    eager_where_concrete,
+    is_concrete,
+)
 from jaxfit._closest._implicit import foot_parameters
 from jaxfit._closest._on_host import feet_on_host
 from jaxfit._closest._steps import AbstractFootMethod, Newton
@@ -58,6 +65,7 @@ class ClosestPoint(eqx.Module):
     steps: Int[Array, " points"]
 
 
+@eager_where_concrete
 def closest_point(
     surface: BSplineSurface | BSplineCurve,
     points: ArrayLike,

@@ -16,14 +16,16 @@ from jaxfit._checks import (
     check_kind,
     check_number,
     check_order,
+    check_steps,
+    eager_where_concrete,
     is_concrete,
 )
 from jaxfit._closest import closest_point
-from jaxfit._fit._fit_result import Fit, Name, history_of, outcome
+from jaxfit._fit._fit_result import Fit, Name, converged_or_raise, history_of
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
-from jaxfit._fit._loop import Carry, Limits, begin, run
+from jaxfit._fit._loop import Carry, Limits, begin, result_of, run
 from jaxfit._fit._orthogonal_distance import OrthogonalDistance
 from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
 from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy, with_smoothing
@@ -37,12 +39,13 @@ MOST_CONTROL_POINTS = 64  # per direction, likewise
 ApproximationMethod = GeometricApproximation | OrthogonalDistance | StandardApproximation
 
 
+@eager_where_concrete
 def approximate(
     points: ArrayLike,
     base: BSplineSurface,
     method: ApproximationMethod | None = None,
-    tol_average: float | None = 6e-4,
-    tol_maximum: float | None = None,
+    tol_average: ArrayLike | None = 6e-4,
+    tol_maximum: ArrayLike | None = None,
     max_steps: int = 200,
     weights: ArrayLike | None = None,
     start: Any = None,
@@ -97,16 +100,17 @@ def approximate(
     method = GeometricApproximation() if method is None else method
     check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
-    check_number("max_steps", max_steps, 0, whole=True)
+    check_steps("max_steps", max_steps)
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
+    dtype = working_dtype()
+    cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
     pulls = _checked_weights(weights, cloud.shape[0])
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
             check_number("tol_average and tol_maximum", tolerance, 0.0)
-            advise_x64(float(tolerance), np.dtype(base.control_points.dtype))
+            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
     unit = unit_of(cloud)
-    concrete = is_concrete(cloud, base, pulls, start)
-    dtype = working_dtype() if is_concrete(cloud, pulls) else jnp.result_type(cloud, float)
+    concrete = is_concrete(cloud, base, pulls, start, tol_average, tol_maximum, method)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
     rule = method.smoothing if isinstance(method, StandardApproximation) else None
@@ -135,7 +139,8 @@ def approximate(
     carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
     surface = _surface(carry, base, begun, unit)
     parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
-    return _finished(carry, method, problem, parts, unit, surface, concrete, throw)
+    fit = _finished(carry, method, problem, parts, unit, surface, concrete)
+    return converged_or_raise(fit) if throw else fit
 
 
 def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
@@ -204,7 +209,6 @@ def _finished(
     unit: Unit,
     surface: BSplineSurface,
     concrete: bool,
-    throw: bool,
 ) -> Fit:
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, errors = (jax.device_put(x) if concrete else x for x in parts[:3])
@@ -216,7 +220,7 @@ def _finished(
         average_error=jnp.asarray(xp.mean(parts[2])),
         maximum_error=jnp.asarray(xp.max(parts[2])),
         history=history_of(carry, method),
-        result=outcome(carry.code, carry.net, throw),
+        result=result_of(carry.code),
         stats={
             "method": Name(type(method).__name__),
             "num_steps": carry.step,
@@ -268,6 +272,7 @@ def _checked_start(start: Any, count: int) -> tuple[Any, Any]:
     return u, v
 
 
+@eager_where_concrete
 def fit_points(
     points: ArrayLike,
     boundary: Boundary | None = None,

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._loop import Carry, result_of
+from jaxfit._fit._loop import Carry
 from jaxfit._fit._results import RESULTS
 from jaxfit._splines import BSplineSurface
 
@@ -88,13 +88,8 @@ class Fit(eqx.Module):
     @property
     def message(self) -> str:
         """Why the fit stopped, in a sentence."""
-        return sentence_of(self.result)
-
-
-def sentence_of(result: Any) -> str:
-    """The sentence that an item of RESULTS stands for."""
-    sentences: Any = RESULTS
-    return sentences[result]
+        sentences: Any = RESULTS
+        return sentences[self.result]
 
 
 def history_of(carry: Carry, method: Any = None) -> History:
@@ -123,19 +118,13 @@ def _marks(net: Any, fairing: Any) -> list[Any]:
     return [xp.asarray(faired), xp.any(net > before, axis=1)]
 
 
-def outcome(code: Any, net: Any, throw: bool) -> Any:
-    """The result with this number; raises its sentence instead if `throw` and the fit has not converged.
+def converged_or_raise(fit: Fit) -> Fit:
+    """The fit; raises its sentence if it has not converged.
 
-    Inside transformations nothing can be raised but by what depends on `net`.
+    Inside transformations whatever depends on the fit raises, when it runs.
     """
-    return checked_outcome(result_of(code), net, throw)
-
-
-def checked_outcome(result: Any, net: Any, throw: bool) -> Any:
-    """`outcome` of an item of RESULTS."""
-    if throw and is_concrete(result):
-        if not bool(result == RESULTS.converged):
-            raise RuntimeError(f"the fit did not converge: {sentence_of(result)}")
-    elif throw:
-        _, result = eqx.error_if((net, result), result != RESULTS.converged, "the fit did not converge.")
-    return jax.tree.map(lambda x: x, result)
+    if is_concrete(fit.result):
+        if not bool(fit.converged):
+            raise RuntimeError(f"the fit did not converge: {fit.message}")
+        return fit
+    return eqx.error_if(fit, fit.result != RESULTS.converged, "the fit did not converge.")

@@ -13,11 +13,11 @@ from jax import Array, lax
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._adjoint import UnrolledAdjoint
-from jaxfit._fit._fit_result import Fit, history_of, outcome
+from jaxfit._fit._fit_result import Fit, history_of
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._grid_outcome import extent_of, is_flat
 from jaxfit._fit._interpolation_derivative import Found, Setting, followed
-from jaxfit._fit._loop import Carry, Limits, begin, code_of, run
+from jaxfit._fit._loop import Carry, Limits, begin, code_of, result_of, run
 from jaxfit._fit._measure import border
 from jaxfit._fit._problem import Problem, Unit, axes_of_averages, unit_of
 from jaxfit._fit._repositioning import lowest_eigenvalue
@@ -63,15 +63,14 @@ def geometric_fit(
     tolerance: Any,
     max_steps: int,
     progress: Callable[[int, int, float, float], None] | None,
-    throw: bool,
 ) -> Fit:
     """The whole fit of a checked grid.
 
     Raises ValueError where concrete data has no extent along one index, or no plane of symmetry.
     """
-    unit = unit_of(grid.reshape(-1, grid.shape[2]))
-    concrete = is_concrete(grid)
-    dtype = working_dtype() if concrete else jnp.result_type(grid, float)
+    unit = unit_of(grid.reshape(-1, grid.shape[2]), "points of grid")
+    concrete = is_concrete(grid, tolerance)
+    dtype = working_dtype()
     inner, symmetry = unit.inward(grid), method.symmetry
     if symmetry is not None:
         symmetry = symmetry.in_unit(unit.centre, unit.scale).located(inner)
@@ -93,7 +92,7 @@ def geometric_fit(
         net = symmetry.symmetrise_points(carry.net)
         carry = eqx.tree_at(lambda c: c.net, carry, net if concrete else lax.stop_gradient(net))
     if concrete:
-        return _fit(carry, problem, unit, grid, start.knots, tolerance, throw)
+        return _fit(carry, problem, unit, grid, start.knots, tolerance)
     measured = carry.measured
     n, m, _ = grid.shape
     found = Found(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
@@ -101,7 +100,7 @@ def geometric_fit(
     carry = eqx.tree_at(lambda c: c.net, carry, found.net)
     feet = found.u.reshape(-1), found.v.reshape(-1)
     carry = eqx.tree_at(lambda c: (c.measured.u, c.measured.v), carry, feet)
-    return _fit(carry, problem, unit, grid, start.knots, tolerance, throw)
+    return _fit(carry, problem, unit, grid, start.knots, tolerance)
 
 
 def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: Reflection | None) -> None:
@@ -145,9 +144,7 @@ def _iterated(
     return run(method, problem, limits, carry, progress if is_concrete(setting) else None), problem
 
 
-def _fit(
-    carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any, throw: bool
-) -> Fit:
+def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any) -> Fit:
     n, m, _ = grid.shape
     concrete = is_concrete(carry, grid)
     xp: Any = np if concrete else jnp
@@ -172,7 +169,7 @@ def _fit(
         average_error=parts[3],
         maximum_error=parts[4],
         history=history_of(carry),
-        result=outcome(code, carry.net, throw),
+        result=result_of(code),
         stats={
             "num_steps": carry.step,
             "diagonal": unit.diagonal,

@@ -8,8 +8,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._fit_result import outcome
-from jaxfit._fit._loop import code_of
+from jaxfit._fit._loop import code_of, result_of
 from jaxfit._fit._results import RESULTS
 from jaxfit._parameters import AbstractParametrisation, grid_parameters
 
@@ -40,7 +39,7 @@ def check_solved(
         )
 
 
-def ending(maximum: Any, loss: Any, tolerance: Any, met: Any, missed: Any, net: Any, throw: bool) -> Any:
+def ending(maximum: Any, loss: Any, tolerance: Any, met: Any, missed: Any) -> Any:
     """The result of a fit whose largest error, of which `loss` is due to rounding the net, is `maximum`.
 
     `met` and `missed` are the numbers of the results if the tolerance is, or is not, met before rounding.
@@ -48,4 +47,4 @@ def ending(maximum: Any, loss: Any, tolerance: Any, met: Any, missed: Any, net: 
     xp: Any = np if is_concrete(maximum, loss, tolerance, met, missed) else jnp
     code = xp.where(maximum - loss <= tolerance, code_of(RESULTS.rounded), missed)
     code = xp.where(maximum <= tolerance, met, code)
-    return outcome(xp.where(xp.isfinite(maximum), code, code_of(RESULTS.diverged)), net, throw)
+    return result_of(xp.where(xp.isfinite(maximum), code, code_of(RESULTS.diverged)))

@@ -3,23 +3,36 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._checks import as_floating, check_kind, check_number, check_order
-from jaxfit._fit._fit_result import Fit
+from jaxfit._checks import (
+    as_floating,
+    check_kind,
+    check_number,
+    check_order,
+    check_steps,
+    eager_where_concrete,
+    is_concrete,
+)
+from jaxfit._fit._fit_result import Fit, converged_or_raise
 from jaxfit._fit._geometric_fit import geometric_fit
 from jaxfit._fit._geometric_interpolation import GeometricInterpolation
 from jaxfit._fit._normal_fit import normal_fit
 from jaxfit._fit._normal_interpolation import NormalInterpolation
 from jaxfit._fit._standard_fit import standard_fit
 from jaxfit._fit._standard_interpolation import StandardInterpolation
+from jaxfit._precision import working_dtype
+
+InterpolationMethod = GeometricInterpolation | StandardInterpolation | NormalInterpolation
 
 
+@eager_where_concrete
 def interpolate(
     grid: ArrayLike,
-    method: GeometricInterpolation | StandardInterpolation | NormalInterpolation | None = None,
+    method: InterpolationMethod | None = None,
     order: tuple[int, int] = (4, 4),
-    tolerance: float | None = None,
+    tolerance: ArrayLike | None = None,
     max_steps: int = 1000,
     progress: Callable[[int, int, float, float], None] | None = None,
     throw: bool = False,
@@ -67,25 +80,27 @@ def interpolate(
     Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and `grad`: the
     surface and the feet have derivatives in the data, errors have none. On a closed grid (first row equal to
     the last) the feet stay on their side of the seam. With `symmetry`, fractions are of the diagonal of the
-    data as given. Outside transformations a float32 grid is fitted in float64 if the session has that.
+    data as given. A grid in single precision is fitted in double precision if the session has that.
     """
     check_order(order)
-    check_number("max_steps", max_steps, 0, whole=True)
+    check_steps("max_steps", max_steps)
     if tolerance is not None:
         check_number("tolerance", tolerance, 0.0)
     data = _checked_grid(grid, order)
     if method is None:
         method = GeometricInterpolation() if normals is None else NormalInterpolation()
-    if isinstance(method, NormalInterpolation):
-        return normal_fit(method, data, normals, order, tolerance, throw)
-    if normals is not None:
+    check_kind("method", method, InterpolationMethod, "GeometricInterpolation()")
+    if normals is not None and not isinstance(method, NormalInterpolation):
         raise ValueError(
             f"normals cannot be met by {type(method).__name__}; pass method=NormalInterpolation()."
         )
-    if isinstance(method, StandardInterpolation):
-        return standard_fit(method, data, order, tolerance, max_steps, throw)
-    check_kind("method", method, GeometricInterpolation, "GeometricInterpolation()")
-    return geometric_fit(method, data, order, tolerance, max_steps, progress, throw)
+    if isinstance(method, NormalInterpolation):
+        fit = normal_fit(method, data, normals, order, tolerance)
+    elif isinstance(method, StandardInterpolation):
+        fit = standard_fit(method, data, order, tolerance, max_steps)
+    else:
+        fit = geometric_fit(method, data, order, tolerance, max_steps, progress)
+    return converged_or_raise(fit) if throw else fit
 
 
 def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
@@ -96,4 +111,5 @@ def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
             f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
             f"shape {data.shape}; give more points or lower the order."
         )
-    return data
+    # NumPy's arrays cost no calls of their own.
+    return np.asarray(data) if is_concrete(data) else data.astype(working_dtype())

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._checks import is_concrete
+from jaxfit._checks import check_number, is_concrete
 from jaxfit._fit._growth import Growth
 from jaxfit._fit._nesterov import Momentum, at_rest
 from jaxfit._fit._pull import Pulls
@@ -131,6 +131,7 @@ class Carry(eqx.Module):
 class AbstractIterativeMethod(eqx.Module):
     """A method that improves a control net step by step. Its fields are known before tracing."""
 
+    foot_tolerance: eqx.AbstractVar[float]
     stall_window: eqx.AbstractVar[int]
     stall_gain: eqx.AbstractVar[float]
 
@@ -140,6 +141,11 @@ class AbstractIterativeMethod(eqx.Module):
     gathers: ClassVar[bool] = False  # pulls, while it measures
     solves: ClassVar[bool] = False  # systems that may be singular
     retreats: ClassVar[bool] = False  # from steps that make the objective worse
+
+    def __check_init__(self) -> None:
+        check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_number("stall_window", self.stall_window, 1, whole=True)
+        check_number("stall_gain", self.stall_gain, 0.0)
 
     @property
     def foresees(self) -> bool:

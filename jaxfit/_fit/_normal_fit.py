@@ -28,7 +28,6 @@ def normal_fit(
     normals: Any,
     order: tuple[int, int],
     tolerance: Any,
-    throw: bool,
 ) -> Fit:
     """The whole fit of a checked grid.
 
@@ -36,9 +35,9 @@ def normal_fit(
     the points are not in space, or concrete data has no extent along one index.
     """
     directions = _checked_normals(normals, grid, order)
-    unit = unit_of(grid.reshape(-1, 3))
+    unit = unit_of(grid.reshape(-1, 3), "points of grid")
     concrete = is_concrete(grid, directions)
-    dtype = working_dtype() if concrete else jnp.result_type(grid, directions, float)
+    dtype = working_dtype()
     xp: Any = np if concrete else jnp
     inner = unit.inward(grid).astype(dtype)
     directions = xp.asarray(directions, np.float64 if concrete else dtype)
@@ -55,7 +54,7 @@ def normal_fit(
     u, v = solution.parameters
     shape = errors.shape
     _, allowed = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
-    result = _ending(maximum, loss, angle, (allowed, method.normal_tolerance), net, throw)
+    result = _ending(maximum, loss, angle, (allowed, method.normal_tolerance), dtype)
     once = xp.zeros(1, dtype)
     entries = [average[None] + once, maximum[None] + once, once, once]
     parts = [xp.broadcast_to(u[:, None], shape), xp.broadcast_to(v[None, :], shape), errors, average, maximum]
@@ -109,10 +108,10 @@ def _checked_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
     return directions
 
 
-def _ending(maximum: Any, loss: Any, angle: Any, limits: tuple[Any, Any], net: Any, throw: bool) -> Any:
-    """Why the fit ended; raises the sentence if `throw` and it has not converged."""
+def _ending(maximum: Any, loss: Any, angle: Any, limits: tuple[Any, Any], dtype: Any) -> Any:
+    """Why the fit ended."""
     tolerance, angle_limit = limits
-    angle_limit = DEFAULT_ANGLE.get(np.dtype(net.dtype).name, 1e-3) if angle_limit is None else angle_limit
+    angle_limit = DEFAULT_ANGLE.get(np.dtype(dtype).name, 1e-3) if angle_limit is None else angle_limit
     xp: Any = np if is_concrete(angle) else jnp
     met = xp.where(angle > angle_limit, code_of(RESULTS.normals_missed), code_of(RESULTS.converged))
-    return ending(maximum, loss, tolerance, met, code_of(RESULTS.stalled), net, throw)
+    return ending(maximum, loss, tolerance, met, code_of(RESULTS.stalled))

@@ -29,8 +29,9 @@ class Problem(eqx.Module):
 
     def ordered(self, order: Any) -> "Problem":
         """The same with its points in another order."""
-        parts = (self.target[:, order], self.weight[order], self.padding[order])
-        return eqx.tree_at(lambda p: (p.target, p.weight, p.padding), self, parts)
+        xp: Any = np if is_concrete(self, order) else jnp
+        parts = [xp.asarray(x)[..., order] for x in (self.target, self.weight, self.padding)]
+        return eqx.tree_at(lambda p: [p.target, p.weight, p.padding], self, parts)
 
     def smoothed(self, smoothing: Any) -> "Problem":
         """The same with a thin plate of this weight."""
@@ -81,14 +82,15 @@ class Unit(eqx.Module):
             return np.asarray(x, np.float64) * self.scale + self.centre
         return x * self.scale + _like(self.centre, x)
 
-    def halves(self, dtype: Any) -> tuple[Any, Any]:
-        """The centre as the sum of two vectors of `dtype`: with the smaller one added first, the outward way
-        rounds but once, although the session may have no double precision.
-        """
+    def within(self, dtype: Any) -> "Outward":
+        """The way out for compiled code in `dtype`, though the session may have no double precision."""
         if not is_concrete(self.centre):
-            return self.centre.astype(dtype), jnp.zeros_like(self.centre, dtype)
+            one = jnp.ones((), dtype)
+            return Outward((self.scale, one), self.centre.astype(dtype), jnp.zeros_like(self.centre, dtype))
         high = np.asarray(self.centre, dtype)
-        return high, np.asarray(self.centre - high, dtype)
+        half = 2.0 ** (round(np.log2(self.scale)) // 2)
+        factors = np.asarray(half, dtype), np.asarray(self.scale / half, dtype)
+        return Outward(factors, high, np.asarray(self.centre - high, dtype))
 
     def loss(self, points: Any) -> Any:
         """At most how far rounding has moved `points`, a net (nu, nv, d) in the user's unit, as a fraction of
@@ -96,8 +98,7 @@ class Unit(eqx.Module):
         """
         xp: Any = np if is_concrete(points) else jnp
         reach = xp.maximum(xp.max(points), -xp.min(points))
-        share = 0.5 * np.finfo(points.dtype).eps * float(np.sqrt(points.shape[2]))
-        return (share * reach / self.diagonal).astype(points.dtype)
+        return rounding_loss(points, reach / self.diagonal)
 
     def least_tolerance(self, dtype: Any) -> Any:
         """About what rounding to `dtype` far from the origin costs, as a fraction of the diagonal."""
@@ -106,14 +107,41 @@ class Unit(eqx.Module):
         return 8.0 * np.finfo(dtype).eps * reach / self.diagonal
 
 
+def rounding_loss(net: Any, reach: Any) -> Any:
+    """What rounding costs a net (nu, nv, d) whose largest coordinate is `reach`, in diagonals."""
+    share = 0.5 * np.finfo(net.dtype).eps * float(np.sqrt(net.shape[2]))
+    return (share * reach).astype(net.dtype)
+
+
+class Outward(eqx.Module):
+    """The change of unit back to the user's, in one precision.
+
+    The scale is a product of two numbers, for it may be beyond the range of this precision where the data is
+    not. The centre is a sum of two: with the smaller added first, the sum is rounded but once.
+    """
+
+    factors: tuple[Float[Any, ""], Float[Any, ""]]
+    high: Float[Any, " d"]
+    low: Float[Any, " d"]
+
+    def __call__(self, x: Float[Array, "n m d"]) -> Float[Array, "n m d"]:
+        """Out of the problem's unit."""
+        return (x * self.factors[0] * self.factors[1] + self.low[None, None]) + self.high[None, None]
+
+    def loss(self, net: Float[Array, "n m d"], diagonal: Array) -> Float[Array, ""]:
+        """`Unit.loss` of a net in the user's unit, the diagonal being in the problem's."""
+        reach = jnp.max(jnp.abs(net)) / self.factors[0] / self.factors[1]
+        return rounding_loss(net, reach / diagonal)
+
+
 def _like(centre: Any, x: Any) -> Any:
     return jnp.asarray(centre, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))
 
 
-def unit_of(points: Any) -> Unit:
+def unit_of(points: Any, name: str = "points") -> Unit:
     """The unit of a cloud (points, d): the middle of its box, and about its diagonal.
 
-    Raises ValueError if all points coincide.
+    Raises ValueError, naming the argument, if all points coincide or are out of range.
     """
     if is_concrete(points):
         points = np.asarray(points, np.float64)
@@ -125,12 +153,18 @@ def unit_of(points: Any) -> Unit:
         diagonal = side * float(np.linalg.norm((high - low) / side)) if side > 0 else 0.0
         if not np.isfinite(diagonal):
             raise ValueError(
-                "points must have differences within the range of float64, but their bounding box has none; "
+                f"{name} must have differences within the range of float64, but their bounding box has none; "
                 "scale them down."
             )
         if not diagonal > 0:
             raise ValueError(
-                "points must not all coincide, but their bounding box has no extent; give distinct points."
+                f"{name} must not all coincide, but their bounding box has no extent; give distinct points."
+            )
+        info = np.finfo(working_dtype())
+        if diagonal < info.tiny / info.eps or max(-low.min(), high.max()) > info.max:
+            raise ValueError(
+                f"{name} must keep to the range of {info.dtype} in size, but the bounding box has the "
+                f"diagonal {diagonal:.3g}; choose another unit of length."
             )
         return Unit(0.5 * (low + high), 2.0 ** round(np.log2(diagonal)), diagonal)
     low, high = jnp.min(points, axis=0), jnp.max(points, axis=0)
@@ -161,7 +195,7 @@ def make_problem(
     """Points in the problem's unit, padded to their bucket where they are concrete."""
     concrete = is_concrete(points, weights)
     count = points.shape[0]
-    dtype = working_dtype() if concrete else jnp.result_type(points, float)
+    dtype = working_dtype()
     inner = unit.inward(points)
     size = bucket(count) if concrete else count
     xp: Any = np if concrete else jnp  # NumPy's arrays cost no calls of their own

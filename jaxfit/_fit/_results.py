@@ -13,12 +13,12 @@ class RESULTS(eqx.Enumeration):
         "or loosen the tolerances."
     )
     stalled = (
-        "the errors have stopped falling above the tolerances; loosen these, use more control points or a "
-        "better base surface for a cloud, or StandardInterpolation for a grid."
+        "the errors have stopped falling above the tolerances; loosen these, or try another method, for a "
+        "cloud also more control points or a better base surface."
     )
     diverged = (
-        "the iteration produced numbers that are not finite or errors that grow, and was taken back to the "
-        "last good surface; check the base surface and the scale of the data."
+        "the computation produced numbers that are not finite or errors that grow, and went back to the last "
+        "good surface if there was one; check the data and the base surface."
     )
     rounded = (
         "the tolerance was met until the control points were rounded; loosen it, work in float64, or, if the "

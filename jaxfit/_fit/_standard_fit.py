@@ -11,11 +11,11 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._fit_result import Fit, History, checked_outcome
+from jaxfit._fit._fit_result import Fit, History
 from jaxfit._fit._grid_outcome import check_solved, ending
 from jaxfit._fit._grid_systems import Account
 from jaxfit._fit._loop import code_of
-from jaxfit._fit._problem import Unit, unit_of
+from jaxfit._fit._problem import Outward, unit_of
 from jaxfit._fit._results import RESULTS
 from jaxfit._fit._standard_interpolation import StandardInterpolation, solved
 from jaxfit._precision import bucket, interpolation_tolerance, working_dtype
@@ -26,11 +26,11 @@ CORNERS = np.asarray([[0], [-1]]), np.asarray([[0, -1]])
 
 
 class Place(eqx.Module):
-    """Where the data lies, and what it is to be fitted to; the diagonal is the user's."""
+    """Where the data lies, and what it is to be fitted to; the diagonal is in the problem's unit."""
 
-    unit: Unit
-    halves: tuple[Float[Any, " d"], Float[Any, " d"]]
+    outward: Outward
     corners: Float[Any, "2 2 d"]
+    diagonal: Float[Any, ""]
     goal: Float[Any, ""]
     tolerance: Float[Any, ""]
     most: Any
@@ -42,20 +42,19 @@ def standard_fit(
     order: tuple[int, int],
     tolerance: Any,
     max_steps: int,
-    throw: bool,
 ) -> Fit:
     """The whole fit of a checked grid.
 
     Raises ValueError where concrete data has no extent along one index, or is too uneven for the order.
     """
-    unit = unit_of(grid.reshape(-1, grid.shape[2]))
-    dtype = np.dtype(working_dtype() if is_concrete(grid) else jnp.result_type(grid, float))
+    unit = unit_of(grid.reshape(-1, grid.shape[2]), "points of grid")
+    dtype = working_dtype()
     inner = unit.inward(grid).astype(dtype)
     goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
-    xp: Any = np if is_concrete(grid, tolerance, max_steps) else jnp
-    limits = xp.asarray(goal, dtype), xp.asarray(tolerance, dtype), xp.asarray(max_steps, np.int32)
+    xp: Any = np if is_concrete(grid, tolerance) else jnp
+    diagonal, goal, tolerance = (xp.asarray(x, dtype) for x in (unit.diagonal / unit.scale, goal, tolerance))
     corners = grid[CORNERS].astype(dtype)
-    place = Place(unit, unit.halves(dtype), corners, *limits)
+    place = Place(unit.within(dtype), corners, diagonal, goal, tolerance, np.int32(max_steps))
     room = bucket(int(max_steps) + 1) if method.iterative else 1
     fit, extent = _fitted(method, (int(order[0]), int(order[1])), room, inner, place)
     fit.stats.update(diagonal=unit.diagonal, tolerance=place.tolerance)
@@ -63,9 +62,6 @@ def standard_fit(
         check_solved(method.parametrisation, order, inner, extent, fit.maximum_error)
         if method.iterative:
             fit = eqx.tree_at(lambda fit: fit.history, fit, _cut(fit.history, int(fit.stats["num_steps"])))
-    if throw:
-        result = checked_outcome(fit.result, fit.surface.control_points, throw)
-        fit = eqx.tree_at(lambda fit: fit.result, fit, result)
     return fit
 
 
@@ -80,16 +76,12 @@ def _fitted(
     """The fit, of whose `stats` some come later, and the extent of the grid. To make the fit in here spares
     the host a good part of the time that a small one takes.
     """
-    unit, dtype = place.unit, data.dtype
-    diagonal = jnp.asarray(unit.diagonal / unit.scale, dtype)
-    solution = solved(method, order, room, data, (diagonal, place.goal, place.most))
-    high, low = (x[None, None] for x in place.halves)
-    net = (solution.net * jnp.asarray(unit.scale, dtype) + low) + high
-    net = net.at[CORNERS].set(place.corners)  # the data, to the last bit
-    loss = lax.stop_gradient(unit.loss(net))
+    solution = solved(method, order, room, data, (place.diagonal, place.goal, place.most))
+    net = place.outward(solution.net).at[CORNERS].set(place.corners)  # the data, to the last bit
+    loss = lax.stop_gradient(place.outward.loss(net, place.diagonal))
     account = solution.account
     maximum = solution.maximum + loss
-    spent = (account.step >= place.most) & (account.step > 0)
+    spent = (account.step >= place.most) & method.iterative
     missed = jnp.where(spent, code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled))
     met = code_of(RESULTS.converged)
     stats = {
@@ -106,7 +98,7 @@ def _fitted(
         average_error=solution.average + loss,
         maximum_error=maximum,
         history=_history(account),
-        result=ending(maximum, loss, place.tolerance, met, missed, net, throw=False),
+        result=ending(maximum, loss, place.tolerance, met, missed),
         stats=stats,
     )
     return fit, solution.extent

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._checks import check_kind, check_number
 from jaxfit._fit._grid_outcome import extent_of
 from jaxfit._fit._grid_systems import (
     Account,
@@ -82,6 +83,12 @@ class StandardInterpolation(eqx.Module):
     max_corrections: int = 10
     foot_tolerance: float = 1e-13
     restart: int = 20
+
+    def __check_init__(self) -> None:
+        check_kind("parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength()")
+        check_number("max_corrections", self.max_corrections, 0, whole=True)
+        check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_number("restart", self.restart, 1, whole=True)
 
     @property
     def iterative(self) -> bool:
