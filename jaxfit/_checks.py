@@ -32,7 +32,7 @@ def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
     def at_once(*args: Any, **options: Any) -> Any:
         if not is_concrete(args, options):
             return function(*args, **options)
-        with jax.ensure_compile_time_eval():
+        with jax.core.eval_context():
             return function(*args, **options)
 
     return at_once
