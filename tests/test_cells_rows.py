@@ -49,10 +49,23 @@ def test_lopsided_clouds_fit_the_bounded_number_of_rows(case):
 
 @pytest.mark.float32_too
 def test_words_too_long_to_pack_are_sorted_all_the_same():
-    # 2^20 cells and 2^13 points need 33 bits: a 64-bit word, or without x64 a sort with a payload.
-    cells = (1 << 20) - 1
-    cell = np.random.default_rng(0).integers(0, cells, (1 << 13) - 1).astype(np.int32)
+    # 2^15 cells and 2^18 points need 33 bits: a 64-bit word, or without x64 a sort with a payload.
+    cells = (1 << 15) - 1
+    cell = np.random.default_rng(0).integers(0, cells, (1 << 18) - 1).astype(np.int32)
     assert_rows(cell, cells, 8)
+
+
+@pytest.mark.float32_too
+def test_far_fewer_points_than_cells_get_rows_of_their_own():
+    cell = np.full(POINTS, CELLS, np.int32)
+    taking_part = np.random.default_rng(0).choice(POINTS, CELLS // 4, replace=False)
+    cell[taking_part] = np.random.default_rng(1).integers(0, CELLS, CELLS // 4)
+    rows = compiled(jnp.asarray(cell), CELLS, 8)
+    assert rows.used == CELLS // 4
+    assert (rows.filled.sum(axis=1)[: CELLS // 4] == 1).all()
+    held = np.asarray(rows.point)[np.asarray(rows.filled)]
+    np.testing.assert_array_equal(np.sort(held), np.sort(taking_part))
+    np.testing.assert_array_equal(rows.cell[: CELLS // 4], cell[held])
 
 
 @pytest.mark.float32_too

@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int, Shaped
 
+# Points get rows of their own where there are so many times fewer than cells.
+SCATTERED = 4
+
 
 class Rows(eqx.Module):
     """Where every point sits: `point[row, slot]` is its number, or `points` for an empty slot.
@@ -52,7 +55,20 @@ def row_count(points: int, cells: int, width: int) -> int:
 
 
 def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
-    """Sort points by their cell number and cut them into rows; numbers >= cells take no part."""
+    """Sort points by their cell number and cut them into rows; numbers >= cells take no part.
+
+    Where there are far fewer points than cells each gets a row of its own, which needs no sorting.
+    """
+    count = row_count(cell.shape[0], cells, width)
+    few = jnp.sum(cell < cells) <= min(cells // SCATTERED, count)
+    return lax.cond(
+        few,
+        lambda: _scattered_rows(cell, cells, width, count),
+        lambda: _sorted_rows(cell, cells, width, count),
+    )
+
+
+def _sorted_rows(cell: Int[Array, " points"], cells: int, width: int, count: int) -> Rows:
     points = cell.shape[0]
     ordered, order = sort_by_cell(cell, cells)
     members = jnp.zeros(cells + 1, jnp.int32).at[jnp.minimum(cell, cells)].add(1)
@@ -62,7 +78,6 @@ def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
     # Sorted position p of cell c sits in slot (first row of c) * width + (p - first position of c).
     slot = jnp.arange(points, dtype=jnp.int32) + (first_row * width - start)[ordered]
     slot = jnp.where(ordered < cells, slot, jnp.iinfo(jnp.int32).max)
-    count = row_count(points, cells, width)
     owner = jnp.zeros(count, jnp.int32).at[slot // width].set(ordered, mode="drop")
     table = jnp.full(count * width, points, jnp.int32).at[slot].set(order, mode="drop")
     return Rows(owner, table.reshape(count, width), until[1, cells - 1], points)
@@ -70,15 +85,19 @@ def make_rows(cell: Int[Array, " points"], cells: int, width: int) -> Rows:
 
 def make_single_rows(cell: Int[Array, " points"], cells: int) -> Rows:
     """A row for each point that takes part, in the points' own order: no sorting, but no cell is shared."""
+    return _scattered_rows(cell, cells, 1, cell.shape[0])
+
+
+def _scattered_rows(cell: Int[Array, " points"], cells: int, width: int, count: int) -> Rows:
+    """In each of the first rows one point."""
     points = cell.shape[0]
     taken = cell < cells
     until = jnp.cumsum(taken, dtype=jnp.int32)
+    row = jnp.where(taken, until - 1, count)
     number = jnp.arange(points, dtype=jnp.int32)
-    table = (
-        jnp.full(points, points, jnp.int32).at[jnp.where(taken, until - 1, points)].set(number, mode="drop")
-    )
-    owner = jnp.minimum(cell[jnp.minimum(table, points - 1)], cells - 1)
-    return Rows(owner, table[:, None], until[points - 1], points)
+    table = jnp.full((count, width), points, jnp.int32).at[row, 0].set(number, mode="drop")
+    owner = jnp.zeros(count, jnp.int32).at[row].set(cell, mode="drop")
+    return Rows(owner, table, until[points - 1], points)
 
 
 def sort_by_cell(

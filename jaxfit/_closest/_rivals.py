@@ -87,11 +87,13 @@ class Search:
             crowded = np.zeros(len(which), bool)
             if near.shape[1] < self.tree.n and more is not None:
                 crowded = self._is_crowded(near[:, -1], index, distance[which])
-            row, column = np.nonzero(self.elsewhere(index, u[which], v[which]) & ~crowded[:, None])
-            there, reach = index[row, column], distance[which[row]]
-            open_ = near[row, column] ** 2 <= reach**2 + self.slack[there] + reach * self.sag[there]
-            who.append(which[row[open_]])
-            sample.append(there[open_])
+            reach = distance[which][:, None]
+            open_ = near**2 <= reach**2 + self.slack[index] + reach * self.sag[index]
+            row, column = np.nonzero(open_ & ~crowded[:, None])
+            there, mine = index[row, column], which[row]
+            apart = self.elsewhere(there, u[mine], v[mine])
+            who.append(mine[apart])
+            sample.append(there[apart])
             which = which[crowded]
             if not which.size:
                 break

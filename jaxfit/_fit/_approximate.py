@@ -182,16 +182,18 @@ def _parts(
     if not concrete:
         back = jnp.argsort(order)
         return tuple(x[back] for x in parts)
-    place = np.argsort(order)[:count]
-    u, v, distances, found = (np.asarray(x)[place] for x in parts)
+    u, v, distances, found = (np.array(np.asarray(x)[:count]) for x in parts)
     projector = _projector(method)
     known = (u, v, distances * float(problem.diagonal), found) if projector is method else None
-    best = global_feet(projector, problem, carry.net, carry.growth, count, max_steps, known)
+    # In the order of the loop, in which neighbours come together.
+    together = problem.ordered(order)
+    best = global_feet(projector, together, carry.net, carry.growth, count, max_steps, known)
     distance = best[2] / float(problem.diagonal)
     nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
         old[nearer] = new[nearer]
-    return u, v, distances, found
+    place = np.argsort(order[:count])
+    return tuple(x[place] for x in (u, v, distances, found))
 
 
 def _projector(method: ApproximationMethod) -> ApproximationMethod:

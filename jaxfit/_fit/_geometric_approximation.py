@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -164,7 +165,16 @@ class GeometricApproximation(AbstractIterativeMethod):
         follower = self.foot_method if self.foresees else None
         # Where residuals are foreseen in the pass itself, those before it give the scale.
         weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
-        feet, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, follower)
+
+        def pulled() -> tuple[Array, Pulls, Array]:
+            return pull(problem, pieces, here.u, here.v, here.error, resting, weigh, follower)
+
+        def still() -> tuple[Array, Pulls, Array]:
+            nothing = jax.tree.map(jnp.zeros_like, measured.pulls)
+            return jnp.stack([here.u, here.v, here.error]), nothing, jnp.asarray(0, jnp.int32)
+
+        # Where no move may follow, only feet are asked for.
+        feet, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
         if self.foresees:
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
             steps = jnp.where(exact, here.steps, 1)
