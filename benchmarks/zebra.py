@@ -4,8 +4,8 @@
 
 All methods start from one dynamic base surface on one net and stop at the same average error, so that the
 zebra stripes and the energies show what each does to the rest of the surface. The curvature energy (9) is
-that of the surface, the thin-plate energy (10) that of its parametrisation, over the squared diagonal; `folds`
-are neighbours on a grid of 400 x 400 parameters whose normals point opposite ways.
+that of the surface, the thin-plate energy (10) that of its parametrisation, over the squared diagonal, and
+`folds` are neighbours on a grid of 400 x 400 parameters whose normals point opposite ways.
 """
 
 import argparse
