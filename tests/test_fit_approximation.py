@@ -134,6 +134,16 @@ def test_fairing_comes_every_so_many_iterations(base):
     assert (np.flatnonzero(np.diff(average) > 0) + 1).tolist() == [5, 10]
 
 
+def test_fairing_a_good_base_surface_is_no_stall(base):
+    near = jf.approximate(POINTS, base, tol_average=1e-9, max_steps=100).surface
+    method = plain(fairing=jf.Fairing(every=5), stall_window=10)
+    fit = jf.approximate(POINTS, near, method, tol_average=1e-9, max_steps=200)
+    average = np.asarray(fit.history.average)
+    assert average[10] > average[0]  # no reason to end there, but that is so from one fairing to others:
+    assert average[15] > average[5]
+    assert int(fit.stats["num_steps"]) == 15
+
+
 def test_local_mode_leaves_alone_what_is_near_enough(base):
     tolerance = 2e-3
     near = np.asarray(jf.approximate(POINTS, base, max_steps=0).errors) <= tolerance

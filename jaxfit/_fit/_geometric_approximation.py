@@ -99,6 +99,11 @@ class GeometricApproximation(AbstractIterativeMethod):
         return self.foresee
 
     @property
+    def comparable_since(self) -> int:
+        """From the first fairing on: a base surface that has not been faired may be nearer."""
+        return 0 if self.fairing is None else self.fairing.every
+
+    @property
     def glides(self) -> bool:
         """Whether there is momentum."""
         return self.acceleration is not None

@@ -84,11 +84,13 @@ class Records(eqx.Module):
         """Whether the average error is greater than in the iteration before."""
         return self.average[step] > self.average[jnp.maximum(step - 1, 0)]
 
-    def is_stalled(self, step: Array, window: int, gain: float) -> Array:
-        """Whether neither error has fallen by the share `gain` within `window` iterations."""
+    def is_stalled(self, step: Array, window: int, gain: float, since: int = 0) -> Array:
+        """Whether neither error has fallen by the share `gain` within `window` iterations, those before
+        `since` not counting.
+        """
         before, keep = jnp.maximum(step - window, 0), 1.0 - gain
         slow = self.average[step] > keep * self.average[before]
-        return slow & (self.maximum[step] > keep * self.maximum[before]) & (step >= window)
+        return slow & (self.maximum[step] > keep * self.maximum[before]) & (step >= window + since)
 
 
 class Turn(eqx.Module):
@@ -151,6 +153,11 @@ class AbstractIterativeMethod(eqx.Module):
     def foresees(self) -> bool:
         """Whether feet between the first surface and the last need not have converged."""
         return False
+
+    @property
+    def comparable_since(self) -> int:
+        """The first iteration whose errors later ones may be compared with."""
+        return 0
 
     @property
     def glides(self) -> bool:
@@ -289,7 +296,10 @@ def _judge(method: AbstractIterativeMethod, limits: Limits, turn: Turn) -> Array
     outcomes = (
         (~finite | (average > GROWTH * records.average[0]), RESULTS.diverged),
         (met, RESULTS.converged),
-        (records.is_stalled(step, method.stall_window, method.stall_gain), RESULTS.stalled),
+        (
+            records.is_stalled(step, method.stall_window, method.stall_gain, method.comparable_since),
+            RESULTS.stalled,
+        ),
         (step >= limits.max_steps, RESULTS.max_steps_reached),
     )
     code = jnp.asarray(code_of(RESULTS.running), jnp.int32)
