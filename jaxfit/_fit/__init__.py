@@ -3,10 +3,10 @@
 from jaxfit._fit._adjoint import ImplicitAdjoint as ImplicitAdjoint
 from jaxfit._fit._adjoint import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit._approximate import approximate as approximate
-from jaxfit._fit._approximate import fit_points as fit_points
 from jaxfit._fit._automatic_smoothing import Discrepancy as Discrepancy
 from jaxfit._fit._automatic_smoothing import GeneralizedCrossValidation as GeneralizedCrossValidation
 from jaxfit._fit._fairing import Fairing as Fairing
+from jaxfit._fit._fit_points import fit_points as fit_points
 from jaxfit._fit._fit_result import Fit as Fit
 from jaxfit._fit._fit_result import History as History
 from jaxfit._fit._frozen import Chebyshev as Chebyshev

@@ -77,10 +77,10 @@ class Unit(eqx.Module):
         return (x - _like(self.centre, x)) / self.scale
 
     def outward(self, x: Any) -> Any:
-        """Back into the user's unit."""
+        """A net or grid, back into the user's unit."""
         if is_concrete(x, self.centre):
             return np.asarray(x, np.float64) * self.scale + self.centre
-        return x * self.scale + _like(self.centre, x)
+        return self.within(x.dtype)(x)
 
     def within(self, dtype: Any) -> "Outward":
         """The way out for compiled code in `dtype`, though the session may have no double precision."""

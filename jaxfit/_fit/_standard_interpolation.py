@@ -1,9 +1,6 @@
 """Standard interpolation of grids: the collocation system of sections 2.2 and 3 of the paper."""
 
-from functools import partial
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
@@ -113,7 +110,6 @@ class Solution(eqx.Module):
     lost: Array  # closest points not found to the tolerance
 
 
-@partial(jax.jit, static_argnames=("method", "order", "room"))
 def solved(
     method: StandardInterpolation,
     order: tuple[int, int],
