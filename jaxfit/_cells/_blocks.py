@@ -15,7 +15,9 @@ SLOTS_PER_BLOCK = 4096
 Total = TypeVar("Total")
 
 
-def over_blocks(rows: Rows, add: Callable[[Rows, Array, Any], Total], begin: Total) -> Total:
+def over_blocks(
+    rows: Rows, add: Callable[[Rows, Array, Any], Total], begin: Total, slots: int = SLOTS_PER_BLOCK
+) -> Total:
     """`add(block, filled, total)` for one block of rows after the other, from `begin`.
 
     `filled` are the slots of a block that hold a point which has not been seen before: the last block
@@ -23,7 +25,7 @@ def over_blocks(rows: Rows, add: Callable[[Rows, Array, Any], Total], begin: Tot
     """
     count, width = rows.point.shape
     on_cpu = jax.default_backend() == "cpu"
-    size = min(count, max(SLOTS_PER_BLOCK // width, 1)) if on_cpu else count
+    size = min(count, max(slots // width, 1)) if on_cpu else count
 
     def block(carry: tuple[Array, Any]) -> tuple[Array, Any]:
         start, total = carry

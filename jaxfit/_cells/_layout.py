@@ -3,12 +3,20 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Bool, Float, Int
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxfit._cells._polynomials import horner
-from jaxfit._cells._rows import Rows, make_rows
+from jaxfit._cells._polynomials import Jet, evaluate_jet, horner
+from jaxfit._cells._rows import Rows, make_rows, make_single_rows
+from jaxfit._cells._stage import staged
 from jaxfit._splines._pieces import Pieces
+
+FEW = 512  # points that are looked up one by one
+
+
+def cells_of(pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"]) -> Int[Array, " points"]:
+    """The number of the cell that each point is in."""
+    return pieces.axis_u.locate(u) * pieces.axis_v.cells + pieces.axis_v.locate(v)
 
 
 def rows_of(
@@ -19,13 +27,53 @@ def rows_of(
     left_out: Bool[Array, " points"],
 ) -> Rows:
     """Rows for points with parameters (u, v), without those `left_out`."""
-    cell = pieces.axis_u.locate(u) * pieces.axis_v.cells + pieces.axis_v.locate(v)
-    return make_rows(jnp.where(left_out, pieces.cells, cell), pieces.cells, width)
+    return make_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells, width)
+
+
+def single_rows_of(
+    pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"], left_out: Bool[Array, " points"]
+) -> Rows:
+    """The same with a row for each point; where few take part, the others are not even located."""
+    points = u.shape[0]
+    number = jnp.nonzero(~left_out, size=min(FEW, points), fill_value=points)[0].astype(jnp.int32)
+
+    def few() -> Rows:
+        at = jnp.minimum(number, points - 1)
+        owner = jnp.zeros(points, jnp.int32).at[: number.shape[0]].set(cells_of(pieces, u[at], v[at]))
+        table = jnp.full((points, 1), points, jnp.int32).at[: number.shape[0], 0].set(number)
+        return Rows(owner, table, jnp.sum(~left_out, dtype=jnp.int32), points)
+
+    def many() -> Rows:
+        return make_single_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells)
+
+    return lax.cond(jnp.sum(~left_out) <= number.shape[0], few, many)
 
 
 def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows 1"]:
     """Every row's polynomial, ready to broadcast along the row."""
     return jnp.moveaxis(pieces.coefficients[rows.cell], 0, -1)[..., None]
+
+
+def in_line(x: Shaped[Array, "*before rows width"]) -> Shaped[Array, "*before slots"]:
+    """All slots of all rows side by side, for vector loops that are not as short as a row."""
+    return x.reshape(*x.shape[:-2], -1)
+
+
+def in_rows(x: Shaped[Array, "*before slots"], rows: int) -> Shaped[Array, "*before rows width"]:
+    """Slots in their rows again, where something belongs to a row."""
+    return x.reshape(*x.shape[:-1], rows, -1)
+
+
+def jet_in_line(
+    always: Array,
+    coefficients: Float[Array, "d K L rows 1"],
+    s: Float[Array, " slots"],
+    t: Float[Array, " slots"],
+) -> Jet:
+    """Value and derivatives in every slot, each evaluated once (`staged`)."""
+    rows = coefficients.shape[-2]
+    jet = staged(always, evaluate_jet, coefficients, in_rows(s, rows), in_rows(t, rows))
+    return Jet(*(in_line(x) for x in jet))
 
 
 def local_coordinates(

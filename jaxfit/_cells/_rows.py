@@ -6,6 +6,8 @@ plain vector arithmetic, with no gather per point. The number of rows is bounded
 cells whatever the distribution, so shapes stay static while points wander.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,9 +24,9 @@ class Rows(eqx.Module):
     The first `used` rows hold points, the others none. Points that take no part have no slot.
     """
 
-    cell: Int[Array, " rows"]
-    point: Int[Array, "rows width"]
-    used: Int[Array, ""]
+    cell: Int[Any, " rows"]
+    point: Int[Any, "rows width"]
+    used: Int[Any, ""]
     points: int = eqx.field(static=True)
 
     @property

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import evaluate_jet, staged
+from jaxfit._cells import jet_in_line, staged
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 MOST_HALVINGS = 40
@@ -164,12 +164,14 @@ def is_going(feet: Feet | Apart, limits: Limits) -> Bool[Array, "*shape"]:
 def advance(
     method: AbstractFootMethod,
     feet: Apart,
-    target: Float[Array, "d *shape"],
-    coefficients: Float[Array, "d K L ..."],
+    target: Float[Array, "d slots"],
+    coefficients: Float[Array, "d K L rows 1"],
     box: Box,
     limits: Limits,
 ) -> Apart:
     """Evaluate every trial, accept or halve it, and propose the next one.
+
+    All but the coefficients is given for each slot, the slots of all rows in one line.
 
     A trial outside the cell whose polynomial is at hand waits until it is laid out with its own.
     """
@@ -218,7 +220,7 @@ def _measure_at(
     """The inner products at the trials."""
     s = (u - box.centre_u) * box.rate_u
     t = (v - box.centre_v) * box.rate_v
-    jet = staged(always, evaluate_jet, coefficients, s, t)
+    jet = jet_in_line(always, coefficients, s, t)
     return staged(always, lambda target, jet: measure(target - jet.value, jet, method.drift), target, jet)
 
 

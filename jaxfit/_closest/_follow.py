@@ -1,40 +1,59 @@
 """Feet that follow a moving surface, one step for each of its moves."""
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet, staged
+from jaxfit._cells import Jet, in_line, in_rows, staged
 from jaxfit._closest._feet import LONGEST_STEP, Box, landing, pins, within
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 
 def follow(
     method: AbstractFootMethod,
-    e: Float[Array, "d *shape"],
+    e: Float[Array, "d slots"],
     jet: Jet,
-    u: Float[Array, "*shape"],
-    v: Float[Array, "*shape"],
+    u: Float[Array, " slots"],
+    v: Float[Array, " slots"],
     box: Box,
     tolerance: Float[Array, ""],
-) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "d *shape"]]:
+) -> tuple[Float[Array, " slots"], Float[Array, " slots"], Float[Array, "d slots"]]:
     r"""One step from feet near their own: where they land, and the residual foreseen there.
 
     To first order the residual after a step $(\delta u, \delta v)$ is $e - R_u \delta u - R_v \delta v$. A
-    step that would lengthen it is cut to where it is shortest.
+    step that would lengthen it is cut to where it is shortest. The slots of all rows are in one line; `box`
+    has one entry a row.
     """
     always = tolerance < jnp.inf
     first = staged(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
-    pinned_s, pinned_t, settled = pins(first, u, v, box, tolerance)
+    pinned_s, pinned_t, settled = pins_in_line(always, first, u, v, box, tolerance)
     ds, dt = method.step(first, pinned_s, pinned_t, settled, always)
-    ds, dt = staged(always, _shortened, first, u, v, ds, dt, settled, box)
 
-    def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
+    def landed(first: Forms, u: Array, v: Array, ds: Array, dt: Array, settled: Array) -> tuple[Array, ...]:
+        ds, dt = _shortened(first, u, v, ds, dt, settled, box)
         next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
-        return next_u, landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+        return next_u, landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v), ds, dt
 
-    next_u, next_v = staged(always, landed, u, v, ds, dt)
+    x = rowwise((first, u, v, ds, dt, settled), box)
+    next_u, next_v, ds, dt = (in_line(x) for x in staged(always, landed, *x))
     return next_u, next_v, e - ds[None] * jet.s - dt[None] * jet.t
+
+
+def pins_in_line(
+    always: Array, first: Forms, u: Array, v: Array, box: Box, tolerance: Array
+) -> tuple[Array, Array, Array]:
+    """`pins` for slots in line."""
+    found = staged(
+        always, lambda first, u, v: pins(first, u, v, box, tolerance), *rowwise((first, u, v), box)
+    )
+    pinned_s, pinned_t, settled = (in_line(x) for x in found)
+    return pinned_s, pinned_t, settled
+
+
+def rowwise(x, box: Box):
+    """Everything in `x` in its rows, which `box` has one entry for."""
+    return jax.tree.map(lambda y: in_rows(y, box.half_u.shape[0]), x)
 
 
 def _shortened(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import SLOTS_PER_BLOCK, Rows, make_rows, make_single_rows, row_width
+from jaxfit._cells import SLOTS_PER_BLOCK, Rows, in_line, make_rows, make_single_rows, row_width
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
 from jaxfit._closest._feet import ARRIVED, Apart, Box, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
@@ -85,9 +85,11 @@ def _pass(
         part = rows.block(start, size)
         coefficients = jnp.moveaxis(pieces.coefficients[part.cell], 0, -1)[..., None]
         box = box_of(pieces, part.cell, [x if x.ndim == 0 else part.spread(x[None])[0] for x in border])
-        goal = part.spread(target)
-        mine = Feet(part.spread(feet.real), part.spread(feet.whole))
-        mine = mine.standing(jnp.where(part.filled, mine.state, ARRIVED))
+        # Stored, not broadcast anew in every loop over the slots: see `in_line`.
+        box = jax.tree.map(lambda x: in_line(jnp.broadcast_to(x, part.point.shape)), box)
+        point, goal = in_line(part.point), in_line(part.spread(target))
+        mine = Feet(in_line(part.spread(feet.real)), in_line(part.spread(feet.whole)))
+        mine = mine.standing(jnp.where(in_line(part.filled), mine.state, ARRIVED))
 
         def unfinished(carry: tuple[Array, Apart]) -> Array:
             return (carry[0] < steps) & jnp.any(is_going(carry[1], limits))
@@ -97,8 +99,8 @@ def _pass(
 
         moved = lax.while_loop(unfinished, step, (jnp.asarray(0, jnp.int32), mine.apart()))[1]
         mine = Feet.of(*moved)
-        real = feet.real.at[:, part.point].set(mine.real, mode="drop")
-        whole = feet.whole.at[:, part.point].set(mine.whole, mode="drop")
+        real = feet.real.at[:, point].set(mine.real, mode="drop")
+        whole = feet.whole.at[:, point].set(mine.whole, mode="drop")
         return start + size, Feet(real, whole)
 
     return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), feet))[1]

@@ -131,7 +131,7 @@ def approximate(
     average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
     limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
     together = order_by_cell(axes, u, v, cloud.shape[0])
-    carry = begin(method, net, u[together], v[together], max_steps, growth)
+    carry = begin(method, net, u[together], v[together], max_steps, problem, growth)
     carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
     surface = _surface(carry, base, begun, unit)
     parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)

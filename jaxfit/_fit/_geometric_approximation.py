@@ -11,12 +11,14 @@ from jax import Array, lax
 
 from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
+from jaxfit._fit._foot_moves import Follow, Stay
 from jaxfit._fit._growth import KnotInsertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._nesterov import LARGEST_RELAXATION, Nesterov, at_rest
 from jaxfit._fit._pull import Pulls, pull
+from jaxfit._fit._pull_at_feet import pull_at_feet
 from jaxfit._fit._region import region_of
 from jaxfit._splines._pieces import Pieces
 
@@ -109,6 +111,11 @@ class GeometricApproximation(AbstractIterativeMethod):
         return self.acceleration is not None
 
     @property
+    def leads(self) -> bool:
+        """Whether feet start from where their last move leads them."""
+        return not self.foresee and self.loss is None  # else weights follow from errors, and these come first
+
+    @property
     def marks(self) -> bool:
         """Whether points that are too far away are remembered."""
         return self.local
@@ -166,24 +173,35 @@ class GeometricApproximation(AbstractIterativeMethod):
             return eqx.tree_at(lambda m: m.error, feet, jnp.where(resting, measured.error, feet.error))
 
         bare = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
-        here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else converged(bare)
-        follower = self.foot_method if self.foresees else None
+        here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else bare
+        if not self.foresees and not self.leads:
+            here = converged(bare)
         # Where residuals are foreseen in the pass itself, those before it give the scale.
         weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
 
-        def pulled() -> tuple[Array, Pulls, Array]:
-            return pull(problem, pieces, here.u, here.v, here.error, resting, weigh, follower)
+        def pulled() -> tuple[Measured, Pulls, Array]:
+            if self.leads:
+                return pull_at_feet(self.foot_method, problem, pieces, measured, resting, weigh)
+            move = Follow(self.foot_method) if self.foresees else Stay()
+            feet, _, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
+            u, v, error = feet
+            return Measured(u, v, error, here.steps, here.found), pulls, active
 
-        def still() -> tuple[Array, Pulls, Array]:
+        def still() -> tuple[Measured, Pulls, Array]:
             nothing = jax.tree.map(jnp.zeros_like, measured.pulls)
-            return jnp.stack([here.u, here.v, here.error]), nothing, jnp.asarray(0, jnp.int32)
+            feet = converged(here) if self.leads else here
+            feet = eqx.tree_at(lambda m: m.ahead, feet, measured.ahead, is_leaf=lambda x: x is None)
+            return feet, nothing, jnp.asarray(0, jnp.int32)
 
         # Where no move may follow, only feet are asked for.
-        feet, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
+        moved, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
         if self.foresees:
-            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
-            steps = jnp.where(exact, here.steps, 1)
-            here = Measured(u, v, error, steps, here.found)
+            u, v, error = (
+                jnp.where(exact, x, y)
+                for x, y in zip((here.u, here.v, here.error), (moved.u, moved.v, moved.error), strict=True)
+            )
+            moved = Measured(u, v, error, jnp.where(exact, here.steps, 1), here.found)
+        here = moved
         poor = None
         if self.local:
             poor = measured.poor | (~idle & (here.error > self._threshold(limits) * problem.diagonal))
@@ -191,7 +209,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             after = region_of(pieces, here.u, here.v, poor)
             touched = jnp.where(exact, after.touched, before.touched)
             pulls = Pulls(jnp.where(touched[..., None], pulls.sums, 0.0))
-        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor)
+        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor, here.ahead)
 
     def _threshold(self, limits: Limits) -> Array:
         """The error beyond which a point is poor."""

@@ -140,7 +140,7 @@ def _iterated(
     most = xp.asarray(max_steps, np.int32)
     limits = Limits(xp.full_like(setting.tolerance, np.inf), setting.tolerance, most)
     u, v = (x.reshape(-1) for x in setting.feet)
-    carry = begin(method, setting.data, u, v, max_steps)
+    carry = begin(method, setting.data, u, v, max_steps, problem)
     return run(method, problem, limits, carry, progress if is_concrete(setting) else None), problem
 
 

@@ -50,7 +50,7 @@ def global_feet(
         inputs = (jnp.asarray(padded(np.asarray(x), size).astype(dtype)) for x in (chosen, u, v))
         target, start_u, start_v = inputs
         mine = eqx.tree_at(lambda p: (p.target, p.weight, p.padding), problem, (target, real, real))
-        first = begin(method, net, start_u, start_v, max_steps, growth)
+        first = begin(method, net, start_u, start_v, max_steps, mine, growth)
         carry = advance(method, mine, limits, nothing, first)
         m = carry.measured
         fields = dict(u=m.u, v=m.v, error=m.error, converged=m.found, steps=m.steps)

@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._cells import KeptRows
 from jaxfit._checks import check_number, is_concrete
 from jaxfit._fit._growth import Growth
 from jaxfit._fit._nesterov import Momentum, at_rest
@@ -31,6 +32,13 @@ LEAST_HISTORY = 1024  # entries, so that other limits on the iterations compile 
 GROWTH = 1e3  # errors beyond this many times the first ones count as divergence
 
 
+class Ahead(eqx.Module):
+    """What feet start with: their last move, and the rows that they were in."""
+
+    drift: Float[Any, "2 points"]
+    kept: KeptRows
+
+
 class Measured(eqx.Module):
     """Feet and errors of all points on a surface. Lengths in the unit of the problem."""
 
@@ -42,6 +50,7 @@ class Measured(eqx.Module):
     active: Int[Any, ""] | None = None  # points of a cloud that play a part
     pulls: Pulls | None = None  # of methods that gather them while they measure
     poor: Bool[Any, " points"] | None = None  # of methods that mark points that are, or were, too far away
+    ahead: Ahead | None = None  # of methods whose feet start from where their last move leads
 
 
 class Limits(eqx.Module):
@@ -165,6 +174,11 @@ class AbstractIterativeMethod(eqx.Module):
         return False
 
     @property
+    def leads(self) -> bool:
+        """Whether feet start from where their last move leads them."""
+        return False
+
+    @property
     def marks(self) -> bool:
         """Whether points that are too far away are remembered."""
         return False
@@ -186,7 +200,13 @@ class AbstractIterativeMethod(eqx.Module):
 
 
 def begin(
-    method: AbstractIterativeMethod, net: Any, u: Any, v: Any, most: int, growth: Growth | None = None
+    method: AbstractIterativeMethod,
+    net: Any,
+    u: Any,
+    v: Any,
+    most: int,
+    problem: Any,
+    growth: Growth | None = None,
 ) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries.
 
@@ -203,7 +223,12 @@ def begin(
     pulls = Pulls(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
     poor = none > 0 if method.marks else None
     shift = xp.zeros((), net.dtype) if method.solves else None
-    measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor)
+    ahead = None
+    if method.leads:
+        axes = (problem.axis_u, problem.axis_v) if growth is None else growth.axes
+        cells = axes[0].cells * axes[1].cells
+        ahead = Ahead(xp.zeros((2, *u.shape), u.dtype), KeptRows.none(u.shape[0], cells))
+    measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor, ahead)
     trust = first_trust(net, u, v) if method.retreats else None
     momentum = at_rest(net) if method.glides else None
     records = Records(empty, empty, empty, empty, counts, sizes)

@@ -5,29 +5,33 @@ it needs stays in a core's caches.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import (
+    SLOTS_PER_BLOCK,
     Rows,
     cells_to_net,
-    evaluate_jet,
-    evaluate_values,
+    in_line,
+    in_rows,
     local_coordinates,
     over_blocks,
-    row_coefficients,
     row_moments,
     row_width,
     rows_of,
+    single_rows_of,
     staged,
 )
-from jaxfit._closest import AbstractFootMethod, box_of, follow
+from jaxfit._fit._foot_moves import AbstractFootMove
 from jaxfit._splines._pieces import Pieces
+
+SLOTS_AGAIN = 256  # of a block of the few points that are looked at again, each in a row of its own
 
 
 class Pulls(eqx.Module):
@@ -44,7 +48,7 @@ class Pulls(eqx.Module):
 
 
 class _Pass(eqx.Module):
-    feet: Float[Array, "3 points"]  # u, v and the length of the residual
+    feet: Float[Array, "4 points"]  # u, v, the length of the residual, and the pass that found the foot, or 0
     cells: Float[Array, "cells K Lc"]
     active: Int[Array, ""]
 
@@ -57,60 +61,88 @@ def pull(
     error: Float[Array, " points"],
     idle: Bool[Array, " points"],
     weigh: Callable[[Array, Array], Array],
-    method: AbstractFootMethod | None,
-) -> tuple[Float[Array, "3 points"], Pulls, Int[Array, ""]]:
-    """The feet with the lengths of their residuals, the sums there, and how many points pull.
+    move: AbstractFootMove,
+    rows: Rows | None = None,
+) -> tuple[Float[Array, "3 points"], Int[Array, " points"], Pulls, Int[Array, ""]]:
+    """The feet with the lengths of their residuals, how many looks it took to be certain of each (0 where
+    that failed), the sums there, and how many points pull.
 
     `idle` points have no part in it, and keep the `error` they have. `weigh(weight, error)` says how much
-    points pull; with a `method` each foot first takes one of its steps, and its residual is the one foreseen.
+    points pull, each at the foot that it has after the `move`; those whose feet are not certain do not.
+    `rows` hold all points that are not idle.
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
-    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
-    (order_u, order_v), d = pieces.order, problem.target.shape[0]
+    order_u, order_v = pieces.order
+    begin = _Pass(
+        jnp.stack([u, v, error, jnp.zeros_like(u)]),
+        jnp.zeros((pieces.cells, order_u, order_v * (problem.target.shape[0] + 1)), u.dtype),
+        jnp.asarray(0, jnp.int32),
+    )
+    one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(pieces))
+    if rows is None:
+        rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
+    done = one(rows, SLOTS_PER_BLOCK, 1, begin)
+    if move.again > 0:
+        done = _again(one, pieces, idle, move.again, done)
+    sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
+    return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), done.active
+
+
+def _again(one: Any, pieces: Pieces, idle: Array, most: int, done: _Pass) -> _Pass:
+    """Passes over the few points whose feet are not certain yet, from where the last pass has left them."""
+
+    def left(done: _Pass) -> Array:
+        return ~idle & (done.feet[3] <= 0)
+
+    def unfinished(carry: tuple[Array, _Pass]) -> Array:
+        return (carry[0] < most) & jnp.any(left(carry[1]))
+
+    def another(carry: tuple[Array, _Pass]) -> tuple[Array, _Pass]:
+        count, done = carry
+        rows = single_rows_of(pieces, done.feet[0], done.feet[1], ~left(done))
+        return count + 1, one(rows, SLOTS_AGAIN, count + 2, done)
+
+    return lax.while_loop(unfinished, another, (jnp.asarray(0, jnp.int32), done))[1]
+
+
+def _one_pass(
+    problem: Any,
+    pieces: Pieces,
+    weigh: Callable[[Array, Array], Array],
+    move: AbstractFootMove,
+    ready: Any,
+    rows: Rows,
+    slots: int,
+    look: Any,
+    begin: _Pass,
+) -> _Pass:
+    """Move the feet in `rows` from where they are, and add up how they pull."""
+    (order_u, order_v), always = pieces.order, problem.diagonal > 0
+    points = jnp.concatenate([problem.target, begin.feet[:2], problem.weight[None]])
 
     def add(part: Rows, filled: Array, done: _Pass) -> _Pass:
-        here = part.spread(jnp.concatenate([problem.target, jnp.stack([u, v, problem.weight])]))
-        next_u, next_v, e = _step(problem, pieces, part, here, method)
-        always = problem.diagonal > 0
+        here, point = in_line(part.spread(points)), in_line(part.point)
+        old_u, old_v, given = here[-3], here[-2], here[-1]
+        u, v, e, certain = move(problem, pieces, ready, part, here[:-3], old_u, old_v)
         error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), e)
+        # A foot that is not certain may not even be a number.
+        safe_u, safe_v = jnp.where(certain, u, old_u), jnp.where(certain, v, old_v)
 
-        def summands(u: Array, v: Array, e: Array, error: Array) -> tuple[Array, Array, Array]:
+        def summands(u: Array, v: Array, e: Array, error: Array, pulls: Array) -> tuple[Array, Array, Array]:
             s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-            weight = jnp.where(filled, weigh(here[-1], error), 0.0)
+            weight = jnp.where(pulls, weigh(in_rows(given, part.cell.shape[0]), error), 0.0)
             # A foot that leaves its cell pulls from the cell's edge this once.
-            values = jnp.concatenate([weight[None] * e, weight[None]])
+            values = jnp.concatenate([weight[None] * jnp.where(pulls[None], e, 0.0), weight[None]])
             return jnp.clip(s, -1.0, 1.0), jnp.clip(t, -1.0, 1.0), values
 
-        s, t, values = staged(always, summands, next_u, next_v, e, error)
+        pulling = in_line(filled) & certain
+        x = (in_rows(x, part.cell.shape[0]) for x in (safe_u, safe_v, e, error, pulling))
+        s, t, values = staged(always, summands, *x)
         moments = row_moments(s, t, values, order_u, order_v)
-        feet = done.feet.at[:, part.point].set(jnp.stack([next_u, next_v, error]), mode="drop")
+        feet = done.feet.at[:, point].set(
+            jnp.stack([u, v, error, jnp.where(certain, look, 0).astype(u.dtype)]), mode="drop"
+        )
         active = done.active + jnp.sum(values[-1] > 0, dtype=jnp.int32)
         return _Pass(feet, done.cells.at[part.cell].add(moments), active)
 
-    begin = _Pass(
-        jnp.stack([u, v, error]),
-        jnp.zeros((pieces.cells, order_u, order_v * (d + 1)), u.dtype),
-        jnp.asarray(0, jnp.int32),
-    )
-    done = over_blocks(rows, add, begin)
-    sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
-    return done.feet, Pulls(sums), done.active
-
-
-def _step(
-    problem: Any, pieces: Pieces, part: Rows, here: Array, method: AbstractFootMethod | None
-) -> tuple[Array, Array, Array]:
-    """Feet and residuals after a step, or as they are."""
-    always = problem.diagonal > 0
-    target, u, v = here[:-3], here[-3], here[-2]
-    s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    coefficients = row_coefficients(pieces, part)
-    if method is None:
-        e = staged(always, lambda *x: target - evaluate_values(*x), coefficients, s, t)
-        return u, v, e
-    jet = staged(always, evaluate_jet, coefficients, s, t)
-    axes = (pieces.axis_u, pieces.axis_v)
-    box = box_of(pieces, part.cell, [x for a in axes for x in (a.breaks[0], a.breaks[-1])])
-    tolerance = problem.foot_tolerance * problem.diagonal
-
-    return follow(method, target - jet.value, jet, u, v, box, tolerance)
+    return over_blocks(rows, add, begin, slots)
