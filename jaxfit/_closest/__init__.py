@@ -6,6 +6,7 @@ from jaxfit._closest._closest_point import ClosestPoint as ClosestPoint
 from jaxfit._closest._closest_point import PointStatus as PointStatus
 from jaxfit._closest._closest_point import closest_point as closest_point
 from jaxfit._closest._feet import Box as Box
+from jaxfit._closest._feet import Limits as Limits
 from jaxfit._closest._follow import follow as follow
 from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._on_host import globally as globally

@@ -113,6 +113,9 @@ def _landed(
     length = jnp.abs(ds) + jnp.abs(dt)
     at_s, at_t = (next_u - box.centre_u) * box.rate_u, (next_v - box.centre_v) * box.rate_v
     inside = (jnp.abs(at_s) <= INSIDE) & (jnp.abs(at_t) <= INSIDE)
+    # All the way: the bound on the third derivatives holds in the cell.
+    inside &= jnp.abs(u - box.centre_u) * box.rate_u <= INSIDE
+    inside &= jnp.abs(v - box.centre_v) * box.rate_v <= INSIDE
     inside &= (next_u >= box.low_u) & (next_u <= box.high_u)
     inside &= (next_v >= box.low_v) & (next_v <= box.high_v)
     near = length < LONGEST_GUESS  # not where it is not a number
@@ -146,7 +149,7 @@ def _is_proven(
         g, size = dot(e, tangent), jnp.sqrt(dot(tangent, tangent))
         doubt = far * turned + shifted * (size + turned)
         settled = jnp.abs(g) + doubt <= tolerance * (size - turned)
-        # What is held at a bound goes on being held there.
-        held = (g * gradient > 0) & (jnp.abs(g) >= doubt)
+        # What is held at a bound goes on being held there; along so short a tangent nothing moves.
+        held = ((g * gradient > 0) & (jnp.abs(g) >= doubt)) | (size + turned <= tolerance)
         proven &= settled | (pinned & held)
     return proven

@@ -4,7 +4,7 @@ A step that increases the distance (beyond rounding) is halved back towards the 
 accepted distances never increase. A bound is active where the gradient points out of it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -144,6 +144,13 @@ class Limits(eqx.Module):
     tolerance: Float[Array, ""]
     noise: Float[Array, ""]
     steps: Int[Array, ""]
+
+    @staticmethod
+    def of(tolerance: Any, target: Float[Array, "d points"], steps: Any) -> "Limits":
+        """With no tolerance below the rounding of a residual, which follows from the largest coordinate."""
+        noise = 4.0 * jnp.finfo(target.dtype).eps * jnp.max(jnp.abs(target))
+        tolerance = jnp.maximum(jnp.asarray(tolerance, target.dtype), 4.0 * noise)
+        return Limits(tolerance, noise, jnp.asarray(steps, jnp.int32))
 
     def slack(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Rounding of a squared distance."""

@@ -33,9 +33,7 @@ def project(
     judged by their largest magnitude.
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
-    noise = 4.0 * jnp.finfo(target.dtype).eps * jnp.max(jnp.abs(target))
-    tolerance = jnp.maximum(jnp.asarray(tolerance, target.dtype), 4.0 * noise)
-    limits = Limits(tolerance, noise, jnp.asarray(max_steps, jnp.int32))
+    limits = Limits.of(tolerance, target, max_steps)
     axes = (pieces.axis_u, pieces.axis_v)
     u, v = (jnp.clip(x, a.breaks[0], a.breaks[-1]) for x, a in zip((u, v), axes, strict=True))
     if within is not None:

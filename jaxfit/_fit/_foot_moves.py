@@ -23,7 +23,7 @@ from jaxfit._cells import (
     row_coefficients,
     staged,
 )
-from jaxfit._closest import AbstractFootMethod, Box, arrive, box_of, follow, third_derivatives
+from jaxfit._closest import AbstractFootMethod, Box, Limits, arrive, box_of, follow, third_derivatives
 from jaxfit._splines._pieces import Pieces
 
 
@@ -41,9 +41,9 @@ class AbstractFootMove(eqx.Module):
 
     again: AbstractClassVar[int]  # how often feet that are not certain are looked at again
 
-    def prepare(self, pieces: Pieces) -> Any:
-        """What every block needs of the surface."""
-        del pieces
+    def prepare(self, problem: Any, pieces: Pieces) -> Any:
+        """What every block needs of the points and the surface."""
+        del problem, pieces
 
     @abstractmethod
     def __call__(
@@ -77,7 +77,8 @@ class Follow(AbstractFootMove):
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `follow`."""
-        jet, box, tolerance = _surroundings(problem, pieces, part, u, v)
+        jet, box = _surroundings(problem, pieces, part, u, v)
+        tolerance = problem.foot_tolerance * problem.diagonal
         moved = follow(self.method, target - jet.value, jet, u, v, box, tolerance)
         return Moved(*moved, jnp.ones(u.shape, bool))
 
@@ -87,25 +88,28 @@ class Arrive(AbstractFootMove):
 
     again: ClassVar[int] = 3
 
-    def prepare(self, pieces: Pieces) -> Float[Array, " cells"]:
-        """Bounds on the third derivatives."""
-        return third_derivatives(pieces)
+    def prepare(self, problem: Any, pieces: Pieces) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
+        """Bounds on the third derivatives, and a tolerance that can be reached."""
+        wanted = problem.foot_tolerance * problem.diagonal
+        return third_derivatives(pieces), Limits.of(wanted, problem.target, 0).tolerance
 
     def __call__(
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `arrive`."""
-        jet, box, tolerance = _surroundings(problem, pieces, part, u, v)
-        third, creased = ready[part.cell][:, None], pieces.axis_u.creased or pieces.axis_v.creased
-        return Moved(*arrive(target - jet.value, jet, u, v, box, third, tolerance, creased))
+        jet, box = _surroundings(problem, pieces, part, u, v)
+        (bounds, tolerance), creased = ready, pieces.axis_u.creased or pieces.axis_v.creased
+        return Moved(
+            *arrive(target - jet.value, jet, u, v, box, bounds[part.cell][:, None], tolerance, creased)
+        )
 
 
-def _surroundings(problem: Any, pieces: Pieces, part: Rows, u: Array, v: Array) -> tuple[Jet, Box, Array]:
-    """Derivatives at the feet, the bounds of their cells, and the tolerance."""
+def _surroundings(problem: Any, pieces: Pieces, part: Rows, u: Array, v: Array) -> tuple[Jet, Box]:
+    """Derivatives at the feet, and the bounds of their cells."""
     s, t = _local(pieces, part, u, v)
     jet = jet_in_line(problem.diagonal > 0, row_coefficients(pieces, part), s, t)
     ends = [x for axis in (pieces.axis_u, pieces.axis_v) for x in (axis.breaks[0], axis.breaks[-1])]
-    return jet, box_of(pieces, part.cell, ends), problem.foot_tolerance * problem.diagonal
+    return jet, box_of(pieces, part.cell, ends)
 
 
 def _local(pieces: Pieces, part: Rows, u: Array, v: Array) -> tuple[Array, Array]:

@@ -47,7 +47,10 @@ class GeometricApproximation(AbstractIterativeMethod):
     foresee : bool
         Whether feet take one step in each iteration, the residual there being foreseen to first order, rather
         than converge (default True; False in the paper). The first and the last surface are measured at
-        converged feet all the same.
+        converged feet all the same. Feet that converge start ahead by most of their last move, and one
+        evaluation is enough for those that are found on the second-order Taylor polynomial there and that a
+        bound on the third derivatives proves to be within the tolerance: nearly all. `foot_method` finds the
+        others.
     insertion : KnotInsertion(), optional
         New knots every few iterations where the errors are greatest; none by default, so that the net stays
         as it is given.
@@ -60,7 +63,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     loss : Huber(), Tukey() or GemanMcClure(), optional
         For points with outliers, which are weighed anew in each iteration; least squares by default.
     foot_method : Newton() or HuWallner()
-        How feet are brought up to date (default Newton).
+        How feet are brought up to date (default Newton; HuWallner in the paper).
     foot_tolerance : float
         To what tangential error, as a fraction of the diagonal. The paper's results do not depend on it
         between 1e-5 and 1e-12.
@@ -172,36 +175,34 @@ class GeometricApproximation(AbstractIterativeMethod):
             feet = measure_feet(self.foot_method, problem, pieces, measured, resting, borders=False)
             return eqx.tree_at(lambda m: m.error, feet, jnp.where(resting, measured.error, feet.error))
 
-        bare = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
-        here = lax.cond(exact, converged, lambda m: m, bare) if self.foresees else bare
-        if not self.foresees and not self.leads:
-            here = converged(bare)
+        here = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
+        if self.loss is not None:  # weights follow from errors, so these come first
+            here = lax.cond(exact, converged, lambda m: m, here) if self.foresees else converged(here)
         # Where residuals are foreseen in the pass itself, those before it give the scale.
         weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
 
-        def pulled() -> tuple[Measured, Pulls, Array]:
-            if self.leads:
-                return pull_at_feet(self.foot_method, problem, pieces, measured, resting, weigh)
+        def at_feet() -> tuple[Measured, Pulls, Array]:
+            return pull_at_feet(self.foot_method, problem, pieces, measured, resting, weigh)
+
+        def one_pass() -> tuple[Measured, Pulls, Array]:
             move = Follow(self.foot_method) if self.foresees else Stay()
             feet, _, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
-            u, v, error = feet
-            return Measured(u, v, error, here.steps, here.found), pulls, active
+            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
+            steps = jnp.where(exact, here.steps, 1) if self.foresees else here.steps
+            return Measured(u, v, error, steps, here.found, ahead=measured.ahead), pulls, active
+
+        def pulled() -> tuple[Measured, Pulls, Array]:
+            if self.loss is not None:
+                return one_pass()
+            return lax.cond(exact, at_feet, one_pass) if self.foresees else at_feet()
 
         def still() -> tuple[Measured, Pulls, Array]:
-            nothing = jax.tree.map(jnp.zeros_like, measured.pulls)
-            feet = converged(here) if self.leads else here
+            feet = converged(here) if self.loss is None else here
             feet = eqx.tree_at(lambda m: m.ahead, feet, measured.ahead, is_leaf=lambda x: x is None)
-            return feet, nothing, jnp.asarray(0, jnp.int32)
+            return feet, jax.tree.map(jnp.zeros_like, measured.pulls), jnp.asarray(0, jnp.int32)
 
         # Where no move may follow, only feet are asked for.
-        moved, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
-        if self.foresees:
-            u, v, error = (
-                jnp.where(exact, x, y)
-                for x, y in zip((here.u, here.v, here.error), (moved.u, moved.v, moved.error), strict=True)
-            )
-            moved = Measured(u, v, error, jnp.where(exact, here.steps, 1), here.found)
-        here = moved
+        here, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
         poor = None
         if self.local:
             poor = measured.poor | (~idle & (here.error > self._threshold(limits) * problem.diagonal))

@@ -78,7 +78,7 @@ def pull(
         jnp.zeros((pieces.cells, order_u, order_v * (problem.target.shape[0] + 1)), u.dtype),
         jnp.asarray(0, jnp.int32),
     )
-    one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(pieces))
+    one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(problem, pieces))
     if rows is None:
         rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
     done = one(rows, SLOTS_PER_BLOCK, 1, begin)
