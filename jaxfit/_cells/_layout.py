@@ -1,5 +1,7 @@
 """Rows laid over the pieces of a spline: which cell a point is in, and what a row needs of its cell."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +16,7 @@ from jaxfit._splines._pieces import Pieces
 FEW = 512  # points that are looked up one by one
 
 
-def cells_of(pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"]) -> Int[Array, " points"]:
+def cells_of(pieces: Pieces, u: Any, v: Any) -> Any:
     """The number of the cell that each point is in."""
     return pieces.axis_u.locate(u) * pieces.axis_v.cells + pieces.axis_v.locate(v)
 
@@ -95,7 +97,7 @@ def values_at(
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
     d, order_u, order_v = pieces.coefficients.shape[1:]
-    cell = pieces.axis_u.locate(u) * pieces.axis_v.cells + pieces.axis_v.locate(v)
+    cell = cells_of(pieces, u, v)
     s, t = local_coordinates(pieces, cell, u, v)
     flat, first = pieces.coefficients.reshape(-1), cell * (d * order_u * order_v)
     number = np.arange(d * order_u * order_v).reshape(d, order_u, order_v)

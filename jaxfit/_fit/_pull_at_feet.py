@@ -19,7 +19,7 @@ from jaxfit._splines._pieces import Axis, Pieces
 LEAD = 0.9  # feet start ahead by so much of their last move, which the next one resembles
 FARTHEST_LEAD = 0.25  # in spans
 # The points left over are mostly few, and then few are looked at; where they are all, it is done in portions.
-FEW = 512
+LEAST_PORTION = 512
 PORTIONS = 8
 
 
@@ -79,7 +79,7 @@ def _others(
     They start from where they were: where the pass has taken them need not be downhill.
     """
     points = most.u.shape[0]
-    size = min(points, max(FEW, points // PORTIONS))
+    size = min(points, max(LEAST_PORTION, points // PORTIONS))
     start = Measured(before.u, before.v, before.error, most.steps, before.found)
 
     def unfinished(carry: tuple[Array, Measured, Array, Array]) -> Array:

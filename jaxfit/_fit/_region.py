@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxfit._cells import cells_of
 from jaxfit._splines._pieces import Pieces
 
 
@@ -26,7 +27,7 @@ def region_of(
     """
     axis_u, axis_v = pieces.axis_u, pieces.axis_v
     order_u, order_v = pieces.order
-    cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)
+    cell = cells_of(pieces, u, v)
     count = jax.ops.segment_sum(poor.astype(jnp.int32), cell, pieces.cells)
     cells = (count > 0).reshape(axis_u.cells, axis_v.cells)
     touched = _widened(_widened(cells, order_u, 0), order_v, 1)
