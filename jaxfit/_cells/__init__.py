@@ -2,6 +2,9 @@
 
 from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
 from jaxfit._cells._blocks import over_blocks as over_blocks
+from jaxfit._cells._few import FEW as FEW
+from jaxfit._cells._few import few_of as few_of
+from jaxfit._cells._few import rows_of_few as rows_of_few
 from jaxfit._cells._kept_rows import KeptRows as KeptRows
 from jaxfit._cells._layout import cells_of as cells_of
 from jaxfit._cells._layout import in_line as in_line
@@ -10,7 +13,6 @@ from jaxfit._cells._layout import jet_in_line as jet_in_line
 from jaxfit._cells._layout import local_coordinates as local_coordinates
 from jaxfit._cells._layout import row_coefficients as row_coefficients
 from jaxfit._cells._layout import rows_of as rows_of
-from jaxfit._cells._layout import single_rows_of as single_rows_of
 from jaxfit._cells._layout import values_at as values_at
 from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet

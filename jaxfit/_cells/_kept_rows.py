@@ -12,7 +12,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells._layout import FEW, cells_of, rows_of
+from jaxfit._cells._few import FEW, few_of, rows_of_few
+from jaxfit._cells._layout import rows_of
 from jaxfit._cells._rows import Rows, row_count, row_width
 from jaxfit._splines._pieces import Pieces
 
@@ -59,13 +60,13 @@ class KeptRows(eqx.Module):
 
         def regrouped() -> KeptRows:
             old = self.rows
-            number = jnp.nonzero(moved, size=min(FEW, points), fill_value=points)[0].astype(jnp.int32)
-            at = jnp.minimum(number, points - 1)
-            own = jnp.arange(number.shape[0], dtype=jnp.int32) + old.used
-            own = jnp.where(number < points, own, old.cell.shape[0])
+            alone = rows_of_few(pieces, u, v, few_of(moved), count)
+            own = jnp.arange(alone.cell.shape[0], dtype=jnp.int32)
+            own = jnp.where(own < count, own + old.used, old.cell.shape[0])
             gone = jnp.concatenate([moved, jnp.zeros(1, bool)])
-            point = jnp.where(gone[old.point], points, old.point).at[own, 0].set(number, mode="drop")
-            cell = old.cell.at[own].set(cells_of(pieces, u[at], v[at]), mode="drop")
+            point = jnp.where(gone[old.point], points, old.point)
+            point = point.at[own, 0].set(alone.point[:, 0], mode="drop")
+            cell = old.cell.at[own].set(alone.cell, mode="drop")
             return KeptRows(Rows(cell, point, old.used + count, points), self.most, self.net)
 
         return lax.cond(stale, sorted_anew, regrouped)

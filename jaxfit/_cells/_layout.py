@@ -5,15 +5,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxfit._cells._polynomials import Jet, evaluate_jet, horner
-from jaxfit._cells._rows import Rows, make_rows, make_single_rows
+from jaxfit._cells._rows import Rows, make_rows
 from jaxfit._cells._stage import staged
 from jaxfit._splines._pieces import Pieces
-
-FEW = 512  # points that are looked up one by one
 
 
 def cells_of(pieces: Pieces, u: Any, v: Any) -> Any:
@@ -30,25 +28,6 @@ def rows_of(
 ) -> Rows:
     """Rows for points with parameters (u, v), without those `left_out`."""
     return make_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells, width)
-
-
-def single_rows_of(
-    pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"], left_out: Bool[Array, " points"]
-) -> Rows:
-    """The same with a row for each point; where few take part, the others are not even located."""
-    points = u.shape[0]
-    number = jnp.nonzero(~left_out, size=min(FEW, points), fill_value=points)[0].astype(jnp.int32)
-
-    def few() -> Rows:
-        at = jnp.minimum(number, points - 1)
-        owner = jnp.zeros(points, jnp.int32).at[: number.shape[0]].set(cells_of(pieces, u[at], v[at]))
-        table = jnp.full((points, 1), points, jnp.int32).at[: number.shape[0], 0].set(number)
-        return Rows(owner, table, jnp.sum(~left_out, dtype=jnp.int32), points)
-
-    def many() -> Rows:
-        return make_single_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells)
-
-    return lax.cond(jnp.sum(~left_out) <= number.shape[0], few, many)
 
 
 def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows 1"]:

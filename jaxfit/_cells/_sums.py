@@ -77,6 +77,9 @@ def cells_to_net(
 
 def _overlapped(terms: list[Any], axis: int) -> Any:
     """The sum of the terms, each one place farther along `axis`."""
-    last = len(terms) - 1
-    shifts = [[(i, last - i) if k == axis else (0, 0) for k in range(x.ndim)] for i, x in enumerate(terms)]
-    return sum(jnp.pad(x, shift) for x, shift in zip(terms, shifts, strict=True))
+    shape, size = list(terms[0].shape), terms[0].shape[axis]
+    shape[axis] += len(terms) - 1
+    total = jnp.zeros(shape, terms[0].dtype)
+    for i, x in enumerate(terms):
+        total = total.at[(slice(None),) * axis + (slice(i, i + size),)].add(x)
+    return total

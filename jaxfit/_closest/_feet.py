@@ -146,10 +146,10 @@ class Limits(eqx.Module):
     steps: Int[Array, ""]
 
     @staticmethod
-    def of(tolerance: Any, target: Float[Array, "d points"], steps: Any) -> "Limits":
-        """With no tolerance below the rounding of a residual, which follows from the largest coordinate."""
-        noise = 4.0 * jnp.finfo(target.dtype).eps * jnp.max(jnp.abs(target))
-        tolerance = jnp.maximum(jnp.asarray(tolerance, target.dtype), 4.0 * noise)
+    def of(tolerance: Any, reach: Float[Array, ""], steps: Any) -> "Limits":
+        """With no tolerance below the rounding of a residual; no coordinate is larger than `reach`."""
+        noise = 4.0 * jnp.finfo(reach.dtype).eps * reach
+        tolerance = jnp.maximum(jnp.asarray(tolerance, reach.dtype), 4.0 * noise)
         return Limits(tolerance, noise, jnp.asarray(steps, jnp.int32))
 
     def slack(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -33,7 +33,7 @@ def project(
     judged by their largest magnitude.
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
-    limits = Limits.of(tolerance, target, max_steps)
+    limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     axes = (pieces.axis_u, pieces.axis_v)
     u, v = (jnp.clip(x, a.breaks[0], a.breaks[-1]) for x, a in zip((u, v), axes, strict=True))
     if within is not None:

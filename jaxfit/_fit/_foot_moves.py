@@ -39,7 +39,7 @@ class Moved(NamedTuple):
 class AbstractFootMove(eqx.Module):
     """What happens to the feet of a block of rows."""
 
-    again: AbstractClassVar[int]  # how often feet that are not certain are looked at again
+    looks: AbstractClassVar[int]  # at most so many at a foot, until it is certain
 
     def prepare(self, problem: Any, pieces: Pieces) -> Any:
         """What every block needs of the points and the surface."""
@@ -55,7 +55,7 @@ class AbstractFootMove(eqx.Module):
 class Stay(AbstractFootMove):
     """Feet as they are."""
 
-    again: ClassVar[int] = 0
+    looks: ClassVar[int] = 1
 
     def __call__(
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
@@ -71,7 +71,7 @@ class Follow(AbstractFootMove):
 
     method: AbstractFootMethod
 
-    again: ClassVar[int] = 0
+    looks: ClassVar[int] = 1
 
     def __call__(
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
@@ -86,12 +86,12 @@ class Follow(AbstractFootMove):
 class Arrive(AbstractFootMove):
     """All the way, in so far as one evaluation proves it; what it does not prove is left to others."""
 
-    again: ClassVar[int] = 3
+    looks: ClassVar[int] = 4
 
     def prepare(self, problem: Any, pieces: Pieces) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
         """Bounds on the third derivatives, and a tolerance that can be reached."""
         wanted = problem.foot_tolerance * problem.diagonal
-        return third_derivatives(pieces), Limits.of(wanted, problem.target, 0).tolerance
+        return third_derivatives(pieces), Limits.of(wanted, problem.diagonal, 0).tolerance
 
     def __call__(
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any

@@ -15,9 +15,11 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import (
+    FEW,
     SLOTS_PER_BLOCK,
     Rows,
     cells_to_net,
+    few_of,
     in_line,
     in_rows,
     local_coordinates,
@@ -25,7 +27,7 @@ from jaxfit._cells import (
     row_moments,
     row_width,
     rows_of,
-    single_rows_of,
+    rows_of_few,
     staged,
 )
 from jaxfit._fit._foot_moves import AbstractFootMove
@@ -79,17 +81,22 @@ def pull(
         jnp.asarray(0, jnp.int32),
     )
     one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(problem, pieces))
+    width = row_width(u.shape[0], pieces.cells)
     if rows is None:
-        rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
-    done = one(rows, SLOTS_PER_BLOCK, 1, begin)
-    if move.again > 0:
-        done = _again(one, pieces, idle, move.again, done)
+        rows = rows_of(pieces, u, v, width, idle)
+    if move.looks == 1:
+        done = one(rows, SLOTS_PER_BLOCK, 1, begin)
+    else:
+        done = _in_looks(one, pieces, idle, rows, move.looks, begin)
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
     return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), done.active
 
 
-def _again(one: Any, pieces: Pieces, idle: Array, most: int, done: _Pass) -> _Pass:
-    """Passes over the few points whose feet are not certain yet, from where the last pass has left them."""
+def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begin: _Pass) -> _Pass:
+    """Passes over those points whose feet are not certain yet, from where the last pass has left them.
+
+    The first has `rows`; later ones lay out anew what is left, a few points each in a row of its own.
+    """
 
     def left(done: _Pass) -> Array:
         return ~idle & (done.feet[3] <= 0)
@@ -98,11 +105,23 @@ def _again(one: Any, pieces: Pieces, idle: Array, most: int, done: _Pass) -> _Pa
         return (carry[0] < most) & jnp.any(left(carry[1]))
 
     def another(carry: tuple[Array, _Pass]) -> tuple[Array, _Pass]:
-        count, done = carry
-        rows = single_rows_of(pieces, done.feet[0], done.feet[1], ~left(done))
-        return count + 1, one(rows, SLOTS_AGAIN, count + 2, done)
+        look, done = carry[0] + 1, carry[1]
+        mine, (u, v) = left(done), done.feet[:2]
+        count, first = jnp.sum(mine, dtype=jnp.int32), look == 1
+        many = first | (count > FEW)
 
-    return lax.while_loop(unfinished, another, (jnp.asarray(0, jnp.int32), done))[1]
+        def anew() -> Rows:
+            return rows_of(pieces, u, v, rows.point.shape[1], ~mine)
+
+        def none() -> Rows:
+            return Rows(rows.cell, rows.point, jnp.zeros_like(rows.used), rows.points)
+
+        shared = lax.cond(first, lambda: rows, lambda: lax.cond(many, anew, none))
+        done = one(shared, SLOTS_PER_BLOCK, look, done)
+        alone = rows_of_few(pieces, u, v, few_of(mine), jnp.where(many, 0, count))
+        return look, one(alone, SLOTS_AGAIN, look, done)
+
+    return lax.while_loop(unfinished, another, (jnp.asarray(0, jnp.int32), begin))[1]
 
 
 def _one_pass(
@@ -118,19 +137,20 @@ def _one_pass(
 ) -> _Pass:
     """Move the feet in `rows` from where they are, and add up how they pull."""
     (order_u, order_v), always = pieces.order, problem.diagonal > 0
-    points = jnp.concatenate([problem.target, begin.feet[:2], problem.weight[None]])
 
     def add(part: Rows, filled: Array, done: _Pass) -> _Pass:
-        here, point = in_line(part.spread(points)), in_line(part.point)
-        old_u, old_v, given = here[-3], here[-2], here[-1]
-        u, v, e, certain = move(problem, pieces, ready, part, here[:-3], old_u, old_v)
+        target, feet, given = (
+            in_line(part.spread(x)) for x in (problem.target, done.feet, problem.weight[None])
+        )
+        old_u, old_v = feet[:2]
+        u, v, e, certain = move(problem, pieces, ready, part, target, old_u, old_v)
         error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), e)
         # A foot that is not certain may not even be a number.
         safe_u, safe_v = jnp.where(certain, u, old_u), jnp.where(certain, v, old_v)
 
         def summands(u: Array, v: Array, e: Array, error: Array, pulls: Array) -> tuple[Array, Array, Array]:
             s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-            weight = jnp.where(pulls, weigh(in_rows(given, part.cell.shape[0]), error), 0.0)
+            weight = jnp.where(pulls, weigh(in_rows(given[0], part.cell.shape[0]), error), 0.0)
             # A foot that leaves its cell pulls from the cell's edge this once.
             values = jnp.concatenate([weight[None] * jnp.where(pulls[None], e, 0.0), weight[None]])
             return jnp.clip(s, -1.0, 1.0), jnp.clip(t, -1.0, 1.0), values
@@ -139,9 +159,9 @@ def _one_pass(
         x = (in_rows(x, part.cell.shape[0]) for x in (safe_u, safe_v, e, error, pulling))
         s, t, values = staged(always, summands, *x)
         moments = row_moments(s, t, values, order_u, order_v)
-        feet = done.feet.at[:, point].set(
-            jnp.stack([u, v, error, jnp.where(certain, look, 0).astype(u.dtype)]), mode="drop"
-        )
+        moved = jnp.stack([u, v, error, jnp.where(certain, look, 0).astype(u.dtype)])
+        point = in_line(jnp.where(filled, part.point, part.points))
+        feet = done.feet.at[:, point].set(moved, mode="drop")
         active = done.active + jnp.sum(values[-1] > 0, dtype=jnp.int32)
         return _Pass(feet, done.cells.at[part.cell].add(moments), active)
 

@@ -47,7 +47,7 @@ def pull_at_feet(
         rows = kept.rows
     feet, looks, pulls, active = pull(problem, pieces, u, v, measured.error, resting, weigh, Arrive(), rows)
     done = resting | (looks > 0)
-    looked = jnp.where(resting, 0, jnp.where(done, looks, 1 + Arrive.again)).astype(jnp.int32)
+    looked = jnp.where(resting, 0, jnp.where(done, looks, Arrive.looks)).astype(jnp.int32)
     u, v = jnp.where(resting, before, feet[:2])
     most = Measured(u, v, feet[2], looked, done)
     here, sums, active = _others(method, problem, pieces, measured, most, weigh, pulls.sums, active)
