@@ -30,9 +30,9 @@ def rows_of(
     return make_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells, width)
 
 
-def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows 1"]:
-    """Every row's polynomial, ready to broadcast along the row."""
-    return jnp.moveaxis(pieces.coefficients[rows.cell], 0, -1)[..., None]
+def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows"]:
+    """Every row's polynomial."""
+    return jnp.moveaxis(pieces.coefficients[rows.cell], 0, -1)
 
 
 def in_line(x: Shaped[Array, "*before rows width"]) -> Shaped[Array, "*before slots"]:
@@ -47,13 +47,19 @@ def in_rows(x: Shaped[Array, "*before slots"], rows: int) -> Shaped[Array, "*bef
 
 def jet_in_line(
     always: Array,
-    coefficients: Float[Array, "d K L rows 1"],
+    coefficients: Float[Array, "d K L rows"],
     s: Float[Array, " slots"],
     t: Float[Array, " slots"],
 ) -> Jet:
     """Value and derivatives in every slot, each evaluated once (`staged`)."""
-    rows = coefficients.shape[-2]
-    jet = staged(always, evaluate_jet, coefficients, in_rows(s, rows), in_rows(t, rows))
+    rows = coefficients.shape[-1]
+    jet = staged(
+        always,
+        lambda c, s, t: evaluate_jet(c[..., None], s, t),
+        coefficients,
+        in_rows(s, rows),
+        in_rows(t, rows),
+    )
     return Jet(*(in_line(x) for x in jet))
 
 

@@ -9,14 +9,17 @@ and L = |ds| + |dt|, the surface is within M L^3 / 6 of R^ there and its tangent
 those of R^, which bounds the tangential part of the true residual.
 """
 
+import functools
 import math
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._cells import Jet, in_line, staged
-from jaxfit._closest._feet import INSIDE, Box
+from jaxfit._closest._box import Box, Sides
+from jaxfit._closest._feet import INSIDE
 from jaxfit._closest._follow import pins_in_line, rowwise
 from jaxfit._closest._steps import Forms, dot, measure
 from jaxfit._splines._pieces import Pieces
@@ -60,12 +63,11 @@ def arrive(
     ds, dt = staged(always, _solve, first, first.gradient_s, first.gradient_t, pinned_s, pinned_t)
     # The same matrix once more, on the polynomial: convergence of order three for one evaluation.
     gs, gt = staged(always, _gradient, e, jet, ds, dt)
-    more_s, more_t = staged(always, _solve, first, gs, gt, pinned_s, pinned_t)
-    ds, dt = ds + more_s, dt + more_t
+    ds, dt = staged(always, _solve, first, gs, gt, pinned_s, pinned_t, ds, dt)
     e = staged(always, _residual, e, jet, ds, dt)
 
     def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array, Array, Array]:
-        return _landed(u, v, ds, dt, box, third)
+        return _landed(u, v, ds, dt, box.along_rows(), third)
 
     landing = staged(always, landed, *rowwise((u, v, ds, dt), box))
     next_u, next_v, turned, inside = (in_line(x) for x in landing)
@@ -82,15 +84,17 @@ def _gradient(e: Array, jet: Jet, ds: Array, dt: Array) -> tuple[Array, Array]:
     return dot(e, tangent_s), dot(e, tangent_t)
 
 
-def _solve(first: Forms, gs: Array, gt: Array, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
-    """Solve with the Hessian at the start; NaN where it is not positive definite."""
+def _solve(
+    first: Forms, gs: Array, gt: Array, pinned_s: Array, pinned_t: Array, ds: Any = 0.0, dt: Any = 0.0
+) -> tuple[Array, Array]:
+    """A Newton step on from (ds, dt), with the Hessian at the start; NaN where this is not definite."""
     a, b, c = first.E - first.e_ss, first.F - first.e_st, first.G - first.e_tt
     gs, gt = jnp.where(pinned_s, 0.0, gs), jnp.where(pinned_t, 0.0, gt)
     a, c = jnp.where(pinned_s, 1.0, a), jnp.where(pinned_t, 1.0, c)
     b = jnp.where(pinned_s | pinned_t, 0.0, b)
     determinant = a * c - b * b
     inverse = jnp.where((a > 0) & (determinant > 0), 1.0, jnp.nan) / determinant
-    return (c * gs - b * gt) * inverse, (a * gt - b * gs) * inverse
+    return ds + (c * gs - b * gt) * inverse, dt + (a * gt - b * gs) * inverse
 
 
 def _residual(e: Array, jet: Jet, ds: Array, dt: Array) -> Array:
@@ -106,16 +110,14 @@ def _tangents(jet: Jet, ds: Array, dt: Array) -> tuple[Array, Array]:
 
 
 def _landed(
-    u: Array, v: Array, ds: Array, dt: Array, box: Box, third: Array
+    u: Array, v: Array, ds: Array, dt: Array, box: Sides, third: Array
 ) -> tuple[Array, Array, Array, Array]:
     """The new parameters, how far the tangents are from the polynomial's, and whether it holds there."""
     next_u, next_v = u + ds * box.half_u, v + dt * box.half_v
     length = jnp.abs(ds) + jnp.abs(dt)
-    at_s, at_t = (next_u - box.centre_u) * box.rate_u, (next_v - box.centre_v) * box.rate_v
-    inside = (jnp.abs(at_s) <= INSIDE) & (jnp.abs(at_t) <= INSIDE)
     # All the way: the bound on the third derivatives holds in the cell.
-    inside &= jnp.abs(u - box.centre_u) * box.rate_u <= INSIDE
-    inside &= jnp.abs(v - box.centre_v) * box.rate_v <= INSIDE
+    ends = (*box.local(u, v), *box.local(next_u, next_v))
+    inside = functools.reduce(jnp.logical_and, (jnp.abs(x) <= INSIDE for x in ends))
     inside &= (next_u >= box.low_u) & (next_u <= box.high_u)
     inside &= (next_v >= box.low_v) & (next_v <= box.high_v)
     near = length < LONGEST_GUESS  # not where it is not a number

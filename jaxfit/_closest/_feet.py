@@ -12,6 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import jet_in_line, staged
+from jaxfit._closest._box import Box, Sides
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 MOST_HALVINGS = 40
@@ -117,24 +118,6 @@ class Apart(NamedTuple):
     state: Int[Array, "*shape"]
 
 
-class Box(eqx.Module):
-    """Bounds on the parameters, and the local coordinates of the cell whose polynomial is evaluated.
-
-    A rate is 1 over half the cell's width: multiplying is cheaper than dividing.
-    """
-
-    low_u: Array
-    high_u: Array
-    low_v: Array
-    high_v: Array
-    centre_u: Array
-    half_u: Array
-    rate_u: Array
-    centre_v: Array
-    half_v: Array
-    rate_v: Array
-
-
 class Limits(eqx.Module):
     """What a foot has to reach, and with how many evaluations.
 
@@ -172,7 +155,7 @@ def advance(
     method: AbstractFootMethod,
     feet: Apart,
     target: Float[Array, "d slots"],
-    coefficients: Float[Array, "d K L rows 1"],
+    coefficients: Float[Array, "d K L rows"],
     box: Box,
     limits: Limits,
 ) -> Apart:
@@ -187,9 +170,9 @@ def advance(
     first = _measure_at(method, always, u, v, target, coefficients, box)
     next_u, next_v, after, foreseen = _next_trial(method, first, u, v, best, steps > PATIENCE, box, limits)
     # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
-    rounding = 8.0 * float(jnp.finfo(u.dtype).eps)
-    off_u = (jnp.abs(u - box.centre_u) - rounding * jnp.abs(u)) * box.rate_u
-    off_v = (jnp.abs(v - box.centre_v) - rounding * jnp.abs(v)) * box.rate_v
+    rounding, sides = 8.0 * float(jnp.finfo(u.dtype).eps), box.apart()
+    off_u = (jnp.abs(u - sides.centre_u) - rounding * jnp.abs(u)) * sides.rate_u
+    off_v = (jnp.abs(v - sides.centre_v) - rounding * jnp.abs(v)) * sides.rate_v
     judged = is_going(feet, limits) & ~(jnp.maximum(off_u, off_v) > INSIDE)
     accepted = first.f <= best + limits.slack(first.f)
     still = (next_u == u) & (next_v == v)
@@ -225,8 +208,7 @@ def _measure_at(
     box: Box,
 ) -> Forms:
     """The inner products at the trials."""
-    s = (u - box.centre_u) * box.rate_u
-    t = (v - box.centre_v) * box.rate_v
+    s, t = box.apart().local(u, v)
     jet = jet_in_line(always, coefficients, s, t)
     return staged(always, lambda target, jet: measure(target - jet.value, jet, method.drift), target, jet)
 
@@ -247,7 +229,7 @@ def _next_trial(
     A foot that has settled, or is held at its bounds, gets its own parameters back.
     """
     always = limits.tolerance < jnp.inf
-    pinned_s, pinned_t, settled = pins(first, u, v, box, limits.tolerance)
+    pinned_s, pinned_t, settled = pins(first, u, v, box.apart(), limits.tolerance)
     ds, dt = method.step(first, pinned_s, pinned_t, late, always)
     ds, dt = staged(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
     return staged(always, _foresee, first, u, v, ds, dt, best, box, limits)
@@ -256,8 +238,9 @@ def _next_trial(
 def _foresee(
     first: Forms, u: Array, v: Array, ds: Array, dt: Array, best: Array, box: Box, limits: Limits
 ) -> tuple[Array, Array, Array, Array]:
-    next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
-    next_v = landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v)
+    sides = box.apart()
+    next_u = landing(u, ds, sides.low_u, sides.high_u, sides.half_u, sides.rate_u)
+    next_v = landing(v, dt, sides.low_v, sides.high_v, sides.half_v, sides.rate_v)
     # |step|^2 in the metric of the Hessian is half the fall of f to come, and was half its last fall.
     fall = first.gradient_s * ds + first.gradient_t * dt
     before = jnp.where(best < jnp.inf, best - first.f, 0.0)
@@ -270,8 +253,10 @@ def _foresee(
     # The distance is foreseen as well as the foot where it is longer than the step.
     foreseen &= fall <= first.f - fall
     # On a bound or in another cell it is not the same polynomial that decides.
-    foreseen &= (next_u > box.low_u) & (next_u < box.high_u) & (next_v > box.low_v) & (next_v < box.high_v)
-    at_s, at_t = (next_u - box.centre_u) * box.rate_u, (next_v - box.centre_v) * box.rate_v
+    foreseen &= (
+        (next_u > sides.low_u) & (next_u < sides.high_u) & (next_v > sides.low_v) & (next_v < sides.high_v)
+    )
+    at_s, at_t = sides.local(next_u, next_v)
     foreseen &= (jnp.abs(at_s) <= INSIDE) & (jnp.abs(at_t) <= INSIDE)
     return next_u, next_v, jnp.maximum(first.f - fall, 0.0), foreseen
 
@@ -298,24 +283,25 @@ def _downhill(
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.
     """
     ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)
-    ds, dt = within(box, u, v, ds, dt)
+    sides = box.apart()
+    ds, dt = within(sides, u, v, ds, dt)
     uphill = first.gradient_s * ds + first.gradient_t * dt <= 0
     tiny = jnp.finfo(u.dtype).tiny
     slope_s = jnp.where(pinned_s, 0.0, 0.5 * first.gradient_s / jnp.maximum(first.E, tiny))
     slope_t = jnp.where(pinned_t, 0.0, 0.5 * first.gradient_t / jnp.maximum(first.G, tiny))
-    slope_s, slope_t = within(box, u, v, slope_s, slope_t)
+    slope_s, slope_t = within(sides, u, v, slope_s, slope_t)
     ds, dt = jnp.where(uphill, slope_s, ds), jnp.where(uphill, slope_t, dt)
     return jnp.where(settled, 0.0, ds), jnp.where(settled, 0.0, dt)
 
 
-def within(box: Box, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
+def within(box: Sides, u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array]:
     """A step in local coordinates, cut off at the bounds."""
     low_s, high_s = (box.low_u - u) * box.rate_u, (box.high_u - u) * box.rate_u
     low_t, high_t = (box.low_v - v) * box.rate_v, (box.high_v - v) * box.rate_v
     return jnp.clip(ds, low_s, high_s), jnp.clip(dt, low_t, high_t)
 
 
-def pins(first: Forms, u: Array, v: Array, box: Box, tolerance: Array) -> tuple[Array, Array, Array]:
+def pins(first: Forms, u: Array, v: Array, box: Sides, tolerance: Array) -> tuple[Array, Array, Array]:
     """Which coordinates are held at a bound by the gradient, and whether the free ones are settled.
 
     Settled: the residual's components along the free tangents, lengths, are below the tolerance.

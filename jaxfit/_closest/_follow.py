@@ -6,7 +6,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._cells import Jet, in_line, in_rows, staged
-from jaxfit._closest._feet import LONGEST_STEP, Box, landing, pins, within
+from jaxfit._closest._box import Box, Sides
+from jaxfit._closest._feet import LONGEST_STEP, landing, pins, within
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
 
 
@@ -31,9 +32,10 @@ def follow(
     ds, dt = method.step(first, pinned_s, pinned_t, settled, always)
 
     def landed(first: Forms, u: Array, v: Array, ds: Array, dt: Array, settled: Array) -> tuple[Array, ...]:
-        ds, dt = _shortened(first, u, v, ds, dt, settled, box)
-        next_u = landing(u, ds, box.low_u, box.high_u, box.half_u, box.rate_u)
-        return next_u, landing(v, dt, box.low_v, box.high_v, box.half_v, box.rate_v), ds, dt
+        sides = box.along_rows()
+        ds, dt = _shortened(first, u, v, ds, dt, settled, sides)
+        next_u = landing(u, ds, sides.low_u, sides.high_u, sides.half_u, sides.rate_u)
+        return next_u, landing(v, dt, sides.low_v, sides.high_v, sides.half_v, sides.rate_v), ds, dt
 
     x = rowwise((first, u, v, ds, dt, settled), box)
     next_u, next_v, ds, dt = (in_line(x) for x in staged(always, landed, *x))
@@ -45,7 +47,9 @@ def pins_in_line(
 ) -> tuple[Array, Array, Array]:
     """`pins` for slots in line."""
     found = staged(
-        always, lambda first, u, v: pins(first, u, v, box, tolerance), *rowwise((first, u, v), box)
+        always,
+        lambda first, u, v: pins(first, u, v, box.along_rows(), tolerance),
+        *rowwise((first, u, v), box),
     )
     pinned_s, pinned_t, settled = (in_line(x) for x in found)
     return pinned_s, pinned_t, settled
@@ -53,11 +57,11 @@ def pins_in_line(
 
 def rowwise(x, box: Box):
     """Everything in `x` in its rows, which `box` has one entry for."""
-    return jax.tree.map(lambda y: in_rows(y, box.half_u.shape[0]), x)
+    return jax.tree.map(lambda y: in_rows(y, box.sides.shape[1]), x)
 
 
 def _shortened(
-    first: Forms, u: Array, v: Array, ds: Array, dt: Array, settled: Array, box: Box
+    first: Forms, u: Array, v: Array, ds: Array, dt: Array, settled: Array, box: Sides
 ) -> tuple[Array, Array]:
     """The step within its bounds, and no longer than it does any good."""
     ds, dt = jnp.clip(ds, -LONGEST_STEP, LONGEST_STEP), jnp.clip(dt, -LONGEST_STEP, LONGEST_STEP)

@@ -5,18 +5,25 @@ it is in. Feet change cells, so the next pass lays them out anew; the first hold
 last ones a few stragglers.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import SLOTS_PER_BLOCK, Rows, in_line, make_rows, make_single_rows, row_width
+from jaxfit._cells import (
+    SLOTS_PER_BLOCK,
+    Rows,
+    in_line,
+    make_rows,
+    make_single_rows,
+    row_coefficients,
+    row_width,
+)
+from jaxfit._closest._box import Box
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
-from jaxfit._closest._feet import ARRIVED, Apart, Box, Feet, Limits, advance, is_going
+from jaxfit._closest._feet import ARRIVED, Apart, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
-from jaxfit._splines._pieces import Axis, Pieces
+from jaxfit._splines._pieces import Pieces
 
 # Where rows hold a single point, laying feet out anew costs less than moving some that have arrived.
 STEPS_PER_PASS = 3
@@ -79,14 +86,16 @@ def _pass(
     steps = STEPS_PER_PASS if width > 1 else STEPS_ALONE
     on_cpu = jax.default_backend() == "cpu"
     size = min(count, SLOTS_PER_BLOCK // width, ROWS_PER_BLOCK) if on_cpu else count
+    boxes = Box.of_cells(pieces)
 
     def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         start, feet = carry
         part = rows.block(start, size)
-        coefficients = jnp.moveaxis(pieces.coefficients[part.cell], 0, -1)[..., None]
-        box = box_of(pieces, part.cell, [x if x.ndim == 0 else part.spread(x[None])[0] for x in border])
+        coefficients = row_coefficients(pieces, part)
+        here = [x if x.ndim == 0 else part.spread(x[None])[0] for x in border]
+        box = boxes.of_rows(part.cell).within(here)
         # Stored, not broadcast anew in every loop over the slots: see `in_line`.
-        box = jax.tree.map(lambda x: in_line(jnp.broadcast_to(x, part.point.shape)), box)
+        box = Box(in_line(jnp.broadcast_to(box.sides, (10, *part.point.shape))))
         point, goal = in_line(part.point), in_line(part.spread(target))
         mine = Feet(in_line(part.spread(feet.real)), in_line(part.spread(feet.whole)))
         mine = mine.standing(jnp.where(in_line(part.filled), mine.state, ARRIVED))
@@ -104,25 +113,3 @@ def _pass(
         return start + size, Feet(real, whole)
 
     return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), feet))[1]
-
-
-def box_of(pieces: Pieces, cell: Array, border: Sequence[Array]) -> Box:
-    """Bounds and local coordinates of cells given by number, with a last axis to broadcast along."""
-    low_u, high_u, centre_u, half_u = _bounds(pieces.axis_u, cell // pieces.axis_v.cells)
-    low_v, high_v, centre_v, half_v = _bounds(pieces.axis_v, cell % pieces.axis_v.cells)
-    return Box(
-        jnp.maximum(low_u, border[0]),
-        jnp.minimum(high_u, border[1]),
-        jnp.maximum(low_v, border[2]),
-        jnp.minimum(high_v, border[3]),
-        centre_u,
-        half_u,
-        1.0 / half_u,
-        centre_v,
-        half_v,
-        1.0 / half_v,
-    )
-
-
-def _bounds(axis: Axis, cell: Array) -> list[Array]:
-    return [x[:, None] for x in axis.bounds[:, cell]]

@@ -4,6 +4,7 @@ The slots of a block of rows are in one line.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -15,15 +16,14 @@ from jaxtyping import Bool, Float
 from jaxfit._cells import (
     Jet,
     Rows,
+    evaluate_jet,
     evaluate_values,
     in_line,
     in_rows,
-    jet_in_line,
-    local_coordinates,
     row_coefficients,
     staged,
 )
-from jaxfit._closest import AbstractFootMethod, Box, Limits, arrive, box_of, follow, third_derivatives
+from jaxfit._closest import AbstractFootMethod, Box, Limits, arrive, follow, third_derivatives
 from jaxfit._splines._pieces import Pieces
 
 
@@ -47,9 +47,9 @@ class AbstractFootMove(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
     ) -> Moved:
-        """Move the feet (u, v) of `target`."""
+        """Move the feet (u, v) of `target`; `box` is that of the rows' cells."""
 
 
 class Stay(AbstractFootMove):
@@ -58,11 +58,10 @@ class Stay(AbstractFootMove):
     looks: ClassVar[int] = 1
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
     ) -> Moved:
         """Only the residuals are evaluated."""
-        s, t = (in_rows(x, part.cell.shape[0]) for x in _local(pieces, part, u, v))
-        values = staged(problem.diagonal > 0, evaluate_values, row_coefficients(pieces, part), s, t)
+        values = _evaluated(evaluate_values, problem, pieces, part, box, u, v)
         return Moved(u, v, target - in_line(values), jnp.ones(u.shape, bool))
 
 
@@ -74,10 +73,10 @@ class Follow(AbstractFootMove):
     looks: ClassVar[int] = 1
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `follow`."""
-        jet, box = _surroundings(problem, pieces, part, u, v)
+        jet = Jet(*map(in_line, _evaluated(evaluate_jet, problem, pieces, part, box, u, v)))
         tolerance = problem.foot_tolerance * problem.diagonal
         moved = follow(self.method, target - jet.value, jet, u, v, box, tolerance)
         return Moved(*moved, jnp.ones(u.shape, bool))
@@ -94,25 +93,23 @@ class Arrive(AbstractFootMove):
         return third_derivatives(pieces), Limits.of(wanted, problem.diagonal, 0).tolerance
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `arrive`."""
-        jet, box = _surroundings(problem, pieces, part, u, v)
+        jet = Jet(*map(in_line, _evaluated(evaluate_jet, problem, pieces, part, box, u, v)))
         (bounds, tolerance), creased = ready, pieces.axis_u.creased or pieces.axis_v.creased
         return Moved(
             *arrive(target - jet.value, jet, u, v, box, bounds[part.cell][:, None], tolerance, creased)
         )
 
 
-def _surroundings(problem: Any, pieces: Pieces, part: Rows, u: Array, v: Array) -> tuple[Jet, Box]:
-    """Derivatives at the feet, and the bounds of their cells."""
-    s, t = _local(pieces, part, u, v)
-    jet = jet_in_line(problem.diagonal > 0, row_coefficients(pieces, part), s, t)
-    ends = [x for axis in (pieces.axis_u, pieces.axis_v) for x in (axis.breaks[0], axis.breaks[-1])]
-    return jet, box_of(pieces, part.cell, ends)
+def _evaluated(
+    evaluate: Callable[..., Any], problem: Any, pieces: Pieces, part: Rows, box: Box, u: Array, v: Array
+) -> Any:
+    """What `evaluate` makes of the rows' polynomials at the feet, in rows, each of its results once."""
 
+    def at_feet(coefficients: Array, box: Box, u: Array, v: Array) -> Any:
+        return evaluate(coefficients[..., None], *box.along_rows().local(u, v))
 
-def _local(pieces: Pieces, part: Rows, u: Array, v: Array) -> tuple[Array, Array]:
-    rows = part.cell.shape[0]
-    s, t = local_coordinates(pieces, part.cell[:, None], in_rows(u, rows), in_rows(v, rows))
-    return in_line(s), in_line(t)
+    u, v = (in_rows(x, part.cell.shape[0]) for x in (u, v))
+    return staged(problem.diagonal > 0, at_feet, row_coefficients(pieces, part), box, u, v)

@@ -16,8 +16,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import KeptRows
 from jaxfit._checks import check_number, is_concrete
+from jaxfit._fit._ahead import Ahead
 from jaxfit._fit._growth import Growth
 from jaxfit._fit._nesterov import Momentum, at_rest
 from jaxfit._fit._pull import Pulls
@@ -30,13 +30,6 @@ FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
 LEAST_HISTORY = 1024  # entries, so that other limits on the iterations compile nothing
 GROWTH = 1e3  # errors beyond this many times the first ones count as divergence
-
-
-class Ahead(eqx.Module):
-    """What feet start with: their last move, and the rows that they were in."""
-
-    drift: Float[Any, "2 points"]
-    kept: KeptRows
 
 
 class Measured(eqx.Module):
@@ -227,7 +220,7 @@ def begin(
     if method.leads:
         axes = (problem.axis_u, problem.axis_v) if growth is None else growth.axes
         cells = axes[0].cells * axes[1].cells
-        ahead = Ahead(xp.zeros((2, *u.shape), u.dtype), KeptRows.none(u.shape[0], cells))
+        ahead = Ahead.none(u, cells)
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor, ahead)
     trust = first_trust(net, u, v) if method.retreats else None
     momentum = at_rest(net) if method.glides else None

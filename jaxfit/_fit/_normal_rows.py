@@ -92,7 +92,8 @@ def _rows_at(
     """Local coordinates, weighted residuals, and the entries of w (Pi + mu (I - Pi))."""
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    jet = staged(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, row_coefficients(pieces, part), s, t)
+    coefficients = row_coefficients(pieces, part)[..., None]
+    jet = staged(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
     e = target - jet.value
     free_s = ~pushed_out(pieces.axis_u, u, e, jet.s)
     free_t = ~pushed_out(pieces.axis_v, v, e, jet.t)

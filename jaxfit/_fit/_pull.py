@@ -22,7 +22,6 @@ from jaxfit._cells import (
     few_of,
     in_line,
     in_rows,
-    local_coordinates,
     over_blocks,
     row_moments,
     row_width,
@@ -30,7 +29,8 @@ from jaxfit._cells import (
     rows_of_few,
     staged,
 )
-from jaxfit._fit._foot_moves import AbstractFootMove
+from jaxfit._closest import Box
+from jaxfit._fit._foot_moves import AbstractFootMove, Moved
 from jaxfit._splines._pieces import Pieces
 
 SLOTS_AGAIN = 256  # of a block of the few points that are looked at again, each in a row of its own
@@ -52,7 +52,6 @@ class Pulls(eqx.Module):
 class _Pass(eqx.Module):
     feet: Float[Array, "4 points"]  # u, v, the length of the residual, and the pass that found the foot, or 0
     cells: Float[Array, "cells K Lc"]
-    active: Int[Array, ""]
 
 
 def pull(
@@ -78,24 +77,25 @@ def pull(
     begin = _Pass(
         jnp.stack([u, v, error, jnp.zeros_like(u)]),
         jnp.zeros((pieces.cells, order_u, order_v * (problem.target.shape[0] + 1)), u.dtype),
-        jnp.asarray(0, jnp.int32),
     )
     one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(problem, pieces))
-    width = row_width(u.shape[0], pieces.cells)
     if rows is None:
-        rows = rows_of(pieces, u, v, width, idle)
+        rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
     if move.looks == 1:
         done = one(rows, SLOTS_PER_BLOCK, 1, begin)
     else:
         done = _in_looks(one, pieces, idle, rows, move.looks, begin)
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
-    return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), done.active
+    pulling = (weigh(problem.weight, done.feet[2]) > 0) & (done.feet[3] > 0)
+    active = jnp.sum(pulling, dtype=jnp.int32)
+    return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), active
 
 
 def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begin: _Pass) -> _Pass:
     """Passes over those points whose feet are not certain yet, from where the last pass has left them.
 
-    The first has `rows`; later ones lay out anew what is left, a few points each in a row of its own.
+    The first has `rows`. Later ones lay out anew what is left, few points each in a row of its own. Of these
+    two layouts one is empty, which costs nothing, while a branch would copy all that is carried.
     """
 
     def left(done: _Pass) -> Array:
@@ -137,32 +137,36 @@ def _one_pass(
 ) -> _Pass:
     """Move the feet in `rows` from where they are, and add up how they pull."""
     (order_u, order_v), always = pieces.order, problem.diagonal > 0
+    boxes = Box.of_cells(pieces)
 
     def add(part: Rows, filled: Array, done: _Pass) -> _Pass:
+        box = boxes.of_rows(part.cell)
         target, feet, given = (
             in_line(part.spread(x)) for x in (problem.target, done.feet, problem.weight[None])
         )
-        old_u, old_v = feet[:2]
-        u, v, e, certain = move(problem, pieces, ready, part, target, old_u, old_v)
-        error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), e)
-        # A foot that is not certain may not even be a number.
-        safe_u, safe_v = jnp.where(certain, u, old_u), jnp.where(certain, v, old_v)
+        moved = move(problem, pieces, ready, part, box, target, *feet[:2])
+        error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), moved.e)
 
-        def summands(u: Array, v: Array, e: Array, error: Array, pulls: Array) -> tuple[Array, Array, Array]:
-            s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-            weight = jnp.where(pulls, weigh(in_rows(given[0], part.cell.shape[0]), error), 0.0)
+        def summands(
+            old: tuple[Array, Array], new: Moved, error: Array, given: Array, box: Box
+        ) -> tuple[Array, Array, Array]:
+            pulls = new.certain
+            weight = jnp.where(pulls, weigh(given, error), 0.0)
+            values = jnp.concatenate([weight[None] * jnp.where(pulls[None], new.e, 0.0), weight[None]])
+            # A foot that is not certain may not even be a number.
+            u, v = (jnp.where(pulls, x, y) for x, y in zip((new.u, new.v), old, strict=True))
+            s, t = box.along_rows().local(u, v)
             # A foot that leaves its cell pulls from the cell's edge this once.
-            values = jnp.concatenate([weight[None] * jnp.where(pulls[None], e, 0.0), weight[None]])
             return jnp.clip(s, -1.0, 1.0), jnp.clip(t, -1.0, 1.0), values
 
-        pulling = in_line(filled) & certain
-        x = (in_rows(x, part.cell.shape[0]) for x in (safe_u, safe_v, e, error, pulling))
-        s, t, values = staged(always, summands, *x)
+        pulling = moved._replace(certain=in_line(filled) & moved.certain)
+        x = ((feet[0], feet[1]), pulling, error, given[0])
+        x = jax.tree.map(lambda y: in_rows(y, part.cell.shape[0]), x)
+        s, t, values = staged(always, summands, *x, box)
         moments = row_moments(s, t, values, order_u, order_v)
-        moved = jnp.stack([u, v, error, jnp.where(certain, look, 0).astype(u.dtype)])
+        found = jnp.where(moved.certain, look, 0).astype(error.dtype)
         point = in_line(jnp.where(filled, part.point, part.points))
-        feet = done.feet.at[:, point].set(moved, mode="drop")
-        active = done.active + jnp.sum(values[-1] > 0, dtype=jnp.int32)
-        return _Pass(feet, done.cells.at[part.cell].add(moments), active)
+        feet = done.feet.at[:, point].set(jnp.stack([moved.u, moved.v, error, found]), mode="drop")
+        return _Pass(feet, done.cells.at[part.cell].add(moments))
 
     return over_blocks(rows, add, begin, slots)

@@ -11,16 +11,12 @@ from jaxtyping import Bool, Int
 
 from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._foot_moves import Arrive, Stay
-from jaxfit._fit._loop import Ahead, Measured
+from jaxfit._fit._loop import Measured
 from jaxfit._fit._measure import measure_feet
 from jaxfit._fit._pull import Pulls, pull
-from jaxfit._splines._pieces import Axis, Pieces
+from jaxfit._splines._pieces import Pieces
 
-LEAD = 0.9  # feet start ahead by so much of their last move, which the next one resembles
-FARTHEST_LEAD = 0.25  # in spans
-# The points left over are mostly few, and then few are looked at; where they are all, it is done in portions.
-LEAST_PORTION = 512
-PORTIONS = 8
+PORTION = 512  # points that are not found in the pass, mostly very few, are dealt with so many at a time
 
 
 def pull_at_feet(
@@ -38,9 +34,8 @@ def pull_at_feet(
     before, rows, kept = jnp.stack([measured.u, measured.v]), None, None
     u, v = before
     if measured.ahead is not None:
-        drift, kept = measured.ahead.drift, measured.ahead.kept
-        u = _led(pieces.axis_u, measured.u, drift[0])
-        v = _led(pieces.axis_v, measured.v, drift[1])
+        kept = measured.ahead.kept
+        u, v = measured.ahead.led((pieces.axis_u, pieces.axis_v), measured.u, measured.v)
     if kept is not None and measured.poor is None:  # else others rest each time
         # Whoever was found at the first look was in its row's cell.
         kept = kept.followed(pieces, u, v, resting, measured.steps != 1)
@@ -51,17 +46,10 @@ def pull_at_feet(
     u, v = jnp.where(resting, before, feet[:2])
     most = Measured(u, v, feet[2], looked, done)
     here, sums, active = _others(method, problem, pieces, measured, most, weigh, pulls.sums, active)
-    if kept is not None:
-        ahead = Ahead(jnp.where(looks > 0, feet[:2] - before, 0.0), kept)
+    if measured.ahead is not None and kept is not None:
+        ahead = measured.ahead.after(jnp.where(looks > 0, feet[:2] - before, 0.0), kept)
         here = eqx.tree_at(lambda m: m.ahead, here, ahead, is_leaf=lambda x: x is None)
     return here, Pulls(sums), active
-
-
-def _led(axis: Axis, u: Array, drift: Array) -> Array:
-    """The parameter ahead, within the domain; not so far that it may be near another foot."""
-    low, high = axis.breaks[0], axis.breaks[-1]
-    farthest = FARTHEST_LEAD * (high - low) / axis.cells
-    return jnp.clip(u + jnp.clip(LEAD * drift, -farthest, farthest), low, high)
 
 
 def _others(
@@ -79,7 +67,7 @@ def _others(
     They start from where they were: where the pass has taken them need not be downhill.
     """
     points = most.u.shape[0]
-    size = min(points, max(LEAST_PORTION, points // PORTIONS))
+    size = min(points, PORTION)
     start = Measured(before.u, before.v, before.error, most.steps, before.found)
 
     def unfinished(carry: tuple[Array, Measured, Array, Array]) -> Array:
