@@ -11,6 +11,7 @@ import jaxfit as jf
 from jaxfit._fit._approximate import unit_of
 from jaxfit._fit._normal_rows import normal_rows
 from jaxfit._fit._problem import axes_of, make_problem
+from jaxfit._fit._second_order import second_order_pull
 from jaxfit._fit._trust import LEAST_DAMPING, first_trust, next_damping, within_reach
 from jaxfit._normal import coupled_cg, preconditioner
 from jaxfit._splines._pieces import pieces_on
@@ -55,15 +56,16 @@ def laid_out(base):
     return problem, net, feet, rows
 
 
+def distances(problem, net, base, feet):
+    """|Q_k - R(u*_k)|, feet being found anew."""
+    surface = jf.BSplineSurface(net, base.knots_u, base.knots_v)
+    return jf.closest_point(surface, problem.target.T[: feet.u.shape[0]], start=(feet.u, feet.v)).distance
+
+
 def slope(problem, net, base, feet, along):
-    """d |Q_k - R(u*_k)| along a change of the net, by central differences of feet found anew."""
-    points = problem.target.T[: feet.u.shape[0]]
-
-    def distances(net):
-        surface = jf.BSplineSurface(net, base.knots_u, base.knots_v)
-        return jf.closest_point(surface, points, start=(feet.u, feet.v)).distance
-
-    return (distances(net + 1e-5 * along) - distances(net - 1e-5 * along)) / 2e-5
+    """d |Q_k - R(u*_k)| along a change of the net, by central differences."""
+    ahead, behind = (distances(problem, net + h * along, base, feet) for h in (1e-5, -1e-5))
+    return (ahead - behind) / 2e-5
 
 
 def test_gradient_and_normal_matrix_are_those_of_the_true_distances(base, laid_out):
@@ -80,6 +82,21 @@ def test_gradient_and_normal_matrix_are_those_of_the_true_distances(base, laid_o
         square, most = (float(jnp.sum(along * x.matrix(along))) for x in (inner, every))
         assert abs(square / float(jnp.sum((inside * change) ** 2)) - 1) < 1e-6
         assert most > float(jnp.sum(change**2))
+
+
+def test_second_derivatives_along_a_move_are_those_of_the_true_distances(base, laid_out):
+    problem, net, feet, _ = laid_out
+    inside = (feet.u > 0) & (feet.u < 1) & (feet.v > 0) & (feet.v < 1)
+    pad = problem.target.shape[1] - len(inside)
+    feet_and_weight = (jnp.pad(x, (0, pad)) for x in (feet.u, feet.v, 1.0 * inside))
+    move, along = np.random.default_rng(3).normal(size=(2, *net.shape))
+    axes = (problem.axis_u, problem.axis_v)
+    pieces, moves = (pieces_on(x, *axes) for x in (net, jnp.asarray(move)))
+    pull = jax.jit(second_order_pull)(problem, pieces, moves, *feet_and_weight)
+    ahead, here, behind = (distances(problem, net + h * move, base, feet) for h in (2e-4, 0.0, -2e-4))
+    bent = (ahead - 2 * here + behind) / 4e-8
+    expected = -0.5 * jnp.sum(inside * bent * slope(problem, net, base, feet, along))
+    assert abs(float(jnp.sum(pull * along) / expected) - 1) < 1e-3
 
 
 def test_full_damping_is_the_matrix_at_fixed_parameters(laid_out):

@@ -21,10 +21,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxfit._cells import (
-    Jet,
     Rows,
     cells_to_net,
     evaluate_jet,
@@ -36,10 +35,9 @@ from jaxfit._cells import (
     rows_of,
     staged,
 )
+from jaxfit._fit._free_tangents import FreeTangents
 from jaxfit._normal import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
-
-PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count as none
 
 
 class NormalRows(eqx.Module):
@@ -95,37 +93,7 @@ def _rows_at(
     coefficients = row_coefficients(pieces, part)[..., None]
     jet = staged(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
     e = target - jet.value
-    free_s = ~pushed_out(pieces.axis_u, u, e, jet.s)
-    free_t = ~pushed_out(pieces.axis_v, v, e, jet.t)
-    tangential = tangent_entries(jet, free_s, free_t)
+    tangential = FreeTangents.at(pieces, u, v, e, jet).entries()
     d = target.shape[0]
     same = jnp.asarray(np.equal(*np.triu_indices(d)), s.dtype)[:, None, None]
     return s, t, weight[None] * e, weight[None] * (same - (1.0 - damping) * tangential)
-
-
-def pushed_out(axis: Any, u: Array, e: Array, tangent: Array) -> Array:
-    """Whether a foot lies on an end of the domain and its residual keeps it there."""
-    along = sum(x * y for x, y in zip(e, tangent, strict=True))
-    return ((u <= axis.breaks[0]) & (along < 0)) | ((u >= axis.breaks[-1]) & (along > 0))
-
-
-def tangent_entries(
-    jet: Jet, free_s: Bool[Array, "..."], free_t: Bool[Array, "..."]
-) -> Float[Array, "pairs ..."]:
-    """The projection I - Pi on the free tangent directions, its entries on and above the diagonal.
-
-    Of parallel tangents one counts.
-    """
-    ds, dt = jnp.where(free_s[None], jet.s, 0.0), jnp.where(free_t[None], jet.t, 0.0)
-    E, F, G = (sum(x * y for x, y in zip(a, b, strict=True)) for a, b in ((ds, ds), (ds, dt), (dt, dt)))
-    share = jnp.where(E > 0, F / jnp.where(E > 0, E, 1.0), 0.0)
-    across = dt - share[None] * ds  # the part of R_t at right angles to R_s
-    length2 = sum(x * x for x in across)
-    counts = length2 > PARALLEL * G
-    per_s = jnp.where(E > 0, 1.0 / jnp.where(E > 0, E, 1.0), 0.0)
-    per_t = jnp.where(counts, 1.0 / jnp.where(counts, length2, 1.0), 0.0)
-    rows, columns = np.triu_indices(ds.shape[0])
-    entries = [
-        per_s * ds[a] * ds[b] + per_t * across[a] * across[b] for a, b in zip(rows, columns, strict=True)
-    ]
-    return jnp.stack(entries)

@@ -1,5 +1,6 @@
 """Orthogonal distance: Gauss-Newton on the true distances, with the feet eliminated."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -17,12 +18,14 @@ from jaxfit._fit._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._normal_rows import NormalRows, normal_rows
 from jaxfit._fit._problem import check_smoothing
+from jaxfit._fit._second_order import second_order_pull
 from jaxfit._fit._trust import Trust, farthest_move, is_plausible, next_damping, within_reach
 from jaxfit._normal import Stencil, coupled_cg, preconditioner, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients
+LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -45,6 +48,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
     space, whatever the curvature; what is left out lies in the tangent space and is of second order in the
     distances.
 
+    Where the net slides along the surface the distances change to second order only. So the step is followed
+    by its correction, which solves the same system for the second derivatives of the residuals along it
+    (geodesic acceleration), at the same feet and at most 0.75 times as long as the step. Steps may then be
+    longer, with less damping.
+
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1; after it mu
     follows the fall of F against the one foreseen. A step after which F, measured at converged feet, has
@@ -63,7 +71,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     loss : Huber(), Tukey() or GemanMcClure(), optional
         For points with outliers; least squares by default.
     damping : float
-        mu of the second step, in (0, 1] (default 0.01).
+        mu of the second step, in (0, 1] (default 0.03).
     reach : float
         Most that a control point moves in a step with mu below 1, as a share of the distance to its
         neighbours (default 0.6).
@@ -85,16 +93,16 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
-    2006. It runs in the loop of all fits rather than in an optimistix solver: the objective is known only
-    when feet have been found, these are taken back together with the net, and nets grow, for which the latter
-    has no place.
+    2006. The correction is that of Transtrum and Sethna (arXiv:1201.5885). It runs in the loop of all fits
+    rather than in an optimistix solver: the objective is known only when feet have been found, these are
+    taken back together with the net, and nets grow, for which the latter has no place.
     """
 
     smoothing: Any = 5e-6
     fixed_boundary: bool = True
     insertion: KnotInsertion | None = None
     loss: Any = None
-    damping: float = 1e-2
+    damping: float = 3e-2
     reach: float = 0.6
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
@@ -109,7 +117,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_loss(self.loss)
         if not 0 < self.damping <= 1:
             raise ValueError(
-                f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."
+                f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.03."
             )
         check_number("reach", self.reach, 0.0)
         if self.reach == 0:
@@ -159,12 +167,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
         weight = reweighted(self.loss, length, true_weight(problem), measured.error)
         held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
         always = problem.diagonal > 0
+        feet = (measured.u, measured.v, weight)
         rows = staged(
             always,
             lambda net, *x: normal_rows(problem, pieces_on(net, *axes), *x),
-            *(net, measured.u, measured.v, weight, trust.damping),
+            *(net, *feet, trust.damping),
         )
-        solve = partial(_stepped, axes, problem.smoothing, self.reach)
+
+        def bends(net: Array, move: Array) -> Array:
+            pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
+            return staged(always, partial(second_order_pull, problem), pieces, moves, *feet)
+
+        solve = partial(_stepped, axes, problem.smoothing, self.reach, bends)
         following, foreseen = staged(always, solve, rows, net, held, trust.damping)
         trust = eqx.tree_at(lambda t: (t.net, t.foreseen), trust, (net, foreseen))
         return Turn(following, turn.step + 1, turn.records, growth, turn.shift, trust)
@@ -191,6 +205,7 @@ def _stepped(
     axes: tuple[Axis, Axis],
     smoothing: Any,
     reach: float,
+    bends: Callable[[Array, Array], Array],
     rows: NormalRows,
     net: Float[Array, "nu nv d"],
     held: Bool[Array, "nu nv"],
@@ -209,4 +224,18 @@ def _stepped(
     near = preconditioner(matrix, uncoupled, free)
     move = coupled_cg(matrix, right, free, near, RESIDUAL, MOST_STEPS)
     move = jnp.where(damping < 1, within_reach(net, move, reach), move)
-    return net + move, jnp.sum(move * (2.0 * right - matrix(move)))
+    foreseen = jnp.sum(move * (2.0 * right - matrix(move)))
+
+    def corrected() -> Array:
+        second = coupled_cg(
+            matrix, jnp.where(free[:, :, None], bends(net, move), 0.0), free, near, RESIDUAL, MOST_STEPS
+        )
+        return move + _at_most(LARGEST_CORRECTION, second, move)
+
+    return net + lax.cond(damping < 1, corrected, lambda: move), foreseen
+
+
+def _at_most(share: float, correction: Array, move: Array) -> Array:
+    """The correction, no longer than a share of the move."""
+    length, most = jnp.sqrt(jnp.sum(correction**2)), share * jnp.sqrt(jnp.sum(move**2))
+    return jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0) * correction
