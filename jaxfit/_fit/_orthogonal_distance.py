@@ -50,15 +50,15 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     Where the net slides along the surface the distances change to second order only. So the step is followed
     by its correction, which solves the same system for the second derivatives of the residuals along it
-    (geodesic acceleration), at the same feet and at most 0.75 times as long as the step. Steps may then be
-    longer, with less damping.
+    (geodesic acceleration), at the same feet and at most 0.75 times as long as the step.
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1; after it mu
     follows the fall of F against the one foreseen. A step after which F, measured at converged feet, has
     not fallen is taken back, so that F never rises; so is one in which a foot has moved by several cells
     without the fall that was foreseen. It counts as an iteration, with the errors of the surface it went
-    back to.
+    back to. F is judged at the feet that the fit follows; the errors it gives back are searched for anew on
+    the whole surface.
 
     Parameters
     ----------
@@ -71,10 +71,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
     loss : Huber(), Tukey() or GemanMcClure(), optional
         For points with outliers; least squares by default.
     damping : float
-        mu of the second step, in (0, 1] (default 0.03).
+        mu of the second step, in (0, 1] (default 0.01).
     reach : float
-        Most that a control point moves in a step with mu below 1, as a share of the distance to its
-        neighbours (default 0.6).
+        Most that a control point moves in a step with mu below 1, correction included, as a share of the
+        distance to its neighbours (default 0.6).
     foot_method, foot_tolerance, stall_window, stall_gain
         As for GeometricApproximation.
 
@@ -102,7 +102,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     fixed_boundary: bool = True
     insertion: KnotInsertion | None = None
     loss: Any = None
-    damping: float = 3e-2
+    damping: float = 1e-2
     reach: float = 0.6
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
@@ -117,7 +117,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_loss(self.loss)
         if not 0 < self.damping <= 1:
             raise ValueError(
-                f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.03."
+                f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."
             )
         check_number("reach", self.reach, 0.0)
         if self.reach == 0:
@@ -227,10 +227,9 @@ def _stepped(
     foreseen = jnp.sum(move * (2.0 * right - matrix(move)))
 
     def corrected() -> Array:
-        second = coupled_cg(
-            matrix, jnp.where(free[:, :, None], bends(net, move), 0.0), free, near, RESIDUAL, MOST_STEPS
-        )
-        return move + _at_most(LARGEST_CORRECTION, second, move)
+        bent = jnp.where(free[:, :, None], bends(net, move), 0.0)
+        second = coupled_cg(matrix, bent, free, near, RESIDUAL, MOST_STEPS)
+        return within_reach(net, move + _at_most(LARGEST_CORRECTION, second, move), reach)
 
     return net + lax.cond(damping < 1, corrected, lambda: move), foreseen
 
