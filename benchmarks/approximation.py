@@ -5,15 +5,19 @@
 `--work` holds stand-ins for the paper's models, each a surface NAME_U.npy, NAME_V.npy, NAME_P.npy, points
 NAME_pts.npy and feet NAME_uv0.npy; `--program` runs the same methods (commands `gapprox` and `sapprox`) and
 prints a line of JSON. Errors are in % of the diagonal, times in s, the first call, which compiles, apart.
+All run on one thread, like the program, unless NPROC says otherwise.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+os.environ.setdefault("NPROC", "1")  # read by JAX as it starts
 
 import jax
 import numpy as np
