@@ -43,9 +43,12 @@ class Pulls(eqx.Module):
 
     @property
     def means(self) -> Float[Array, "nu nv d"]:
-        """Weighted means of the error vectors around each control point, 0 where no point pulls."""
+        """Weighted means of the error vectors around each control point, 0 where no point pulls.
+
+        Sums so small against the largest that rounding decides them count as none.
+        """
         total = self.sums[..., -1:]
-        touched = total > 0
+        touched = total > jnp.finfo(total.dtype).eps ** 0.625 * jnp.max(total)
         return jnp.where(touched, self.sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
 
 
