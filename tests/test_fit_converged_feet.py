@@ -10,7 +10,7 @@ import jaxfit as jf
 from jaxfit._cells import KeptRows
 from jaxfit._fit._foot_moves import Arrive
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._pull import pull
+from jaxfit._fit._pull import _above_rounding, pull
 from jaxfit._splines._pieces import make_pieces
 
 POINTS, EDGES = wavy_cloud(1500)
@@ -120,3 +120,19 @@ def test_kept_rows_hold_every_point_in_a_row_of_its_cell(share):
         assert_kept(kept, pieces, u, v, left_out)
         moved = rng.uniform(size=count) < share
         u, v = (np.where(moved, rng.uniform(0, 1, count), x) for x in (u, v))
+
+
+@pytest.mark.float32_too
+def test_only_sums_that_rounding_decides_count_as_none():
+    heavy, light = 3e4, 1e-3
+    total = np.zeros((30, 20))
+    total[2, 3], total[5, 5], total[8, 6] = heavy, 1e-9 * heavy, 1e-9 * heavy  # the last shares no cell
+    total[20:25, 10:14], total[21, 12] = light, 1e-14 * light
+    sums = jnp.asarray(np.stack([2.0 * total, total], axis=-1), jnp.result_type(float))
+    kept = np.asarray(_above_rounding(sums, (4, 4)))
+    single = sums.dtype == jnp.float32
+    expected = np.asarray(sums).copy()
+    expected[21, 12] = 0.0
+    if single:
+        expected[5, 5] = 0.0
+    np.testing.assert_array_equal(kept, expected)

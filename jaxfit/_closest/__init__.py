@@ -17,3 +17,4 @@ from jaxfit._closest._project import project as project
 from jaxfit._closest._steps import AbstractFootMethod as AbstractFootMethod
 from jaxfit._closest._steps import HuWallner as HuWallner
 from jaxfit._closest._steps import Newton as Newton
+from jaxfit._closest._steps import dot as dot

@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._cells import Jet
+from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
 
 PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count as none
@@ -63,8 +64,3 @@ def _held(axis: Any, u: Array, e: Array, tangent: Array) -> Array:
     """Whether a foot lies on an end of the domain and its residual keeps it there."""
     along = dot(e, tangent)
     return ((u <= axis.breaks[0]) & (along < 0)) | ((u >= axis.breaks[-1]) & (along > 0))
-
-
-def dot(a: Float[Array, "d ..."], b: Float[Array, "d ..."]) -> Float[Array, "..."]:
-    """Inner products, written out: a reduction of so few numbers takes longer than the sum."""
-    return sum((x * y for x, y in zip(a, b, strict=True)), jnp.zeros_like(a[0]))

@@ -43,12 +43,9 @@ class Pulls(eqx.Module):
 
     @property
     def means(self) -> Float[Array, "nu nv d"]:
-        """Weighted means of the error vectors around each control point, 0 where no point pulls.
-
-        Sums so small against the largest that rounding decides them count as none.
-        """
+        """Weighted means of the error vectors around each control point, 0 where no point pulls."""
         total = self.sums[..., -1:]
-        touched = total > jnp.finfo(total.dtype).eps ** 0.625 * jnp.max(total)
+        touched = total > 0
         return jnp.where(touched, self.sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
 
 
@@ -89,9 +86,21 @@ def pull(
     else:
         done = _in_looks(one, pieces, idle, rows, move.looks, begin)
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
+    sums = _above_rounding(sums, pieces.order)
     pulling = (weigh(problem.weight, done.feet[2]) > 0) & (done.feet[3] > 0)
     active = jnp.sum(pulling, dtype=jnp.int32)
     return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), active
+
+
+def _above_rounding(sums: Array, order: tuple[int, int]) -> Array:
+    """Sums of weights, and what goes with them, that are not so small that rounding decides them.
+
+    What rounds a sum is as large as those of the control points with which it shares a cell.
+    """
+    total = lax.stop_gradient(sums[..., -1:])
+    window = (2 * order[0] - 1, 2 * order[1] - 1, 1)
+    largest = lax.reduce_window(total, 0.0, lax.max, window, (1, 1, 1), "SAME")
+    return jnp.where(total > jnp.finfo(sums.dtype).eps ** 0.75 * largest, sums, 0.0)
 
 
 def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begin: _Pass) -> _Pass:

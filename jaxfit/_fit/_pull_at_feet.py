@@ -9,14 +9,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
+from jaxfit._cells import few_of
 from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._foot_moves import Arrive, Stay
 from jaxfit._fit._loop import Measured
 from jaxfit._fit._measure import measure_feet
 from jaxfit._fit._pull import Pulls, pull
 from jaxfit._splines._pieces import Pieces
-
-PORTION = 512  # points that are not found in the pass, mostly very few, are dealt with so many at a time
 
 
 def pull_at_feet(
@@ -62,12 +61,12 @@ def _others(
     sums: Array,
     active: Array,
 ) -> tuple[Measured, Array, Array]:
-    """With the feet that have not been found and what they add, a portion of them after the other.
+    """With the feet that have not been found and what they add, as many at a time as `few_of` gives: mostly
+    there are very few.
 
     They start from where they were: where the pass has taken them need not be downhill.
     """
     points = most.u.shape[0]
-    size = min(points, PORTION)
     start = Measured(before.u, before.v, before.error, most.steps, before.found)
 
     def unfinished(carry: tuple[Array, Measured, Array, Array]) -> Array:
@@ -75,7 +74,7 @@ def _others(
 
     def portion(carry: tuple[Array, Measured, Array, Array]) -> tuple[Array, Measured, Array, Array]:
         left, total, sums, active = carry
-        number = jnp.nonzero(left, size=size, fill_value=points)[0]
+        number = few_of(left)
         at, known = jnp.minimum(number, points - 1), number == points
         some, here = problem.ordered(at), jax.tree.map(lambda x: x[at], start)
         feet = measure_feet(method, some, pieces, here, known, borders=False)

@@ -29,7 +29,8 @@ from jaxfit._cells import (
     rows_of,
     staged,
 )
-from jaxfit._fit._free_tangents import FreeTangents, dot
+from jaxfit._closest import dot
+from jaxfit._fit._free_tangents import FreeTangents
 from jaxfit._splines._pieces import Pieces
 
 NEAR = 0.5  # the share of the first form that must be left in the Hessian
