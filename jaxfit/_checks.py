@@ -178,6 +178,8 @@ def check_number(name: str, value: Any, least: int | float, whole: bool = False)
         return
     kind = "a whole number" if whole else "a number"
     try:
+        if isinstance(value, (str, bytes, bool)):
+            raise TypeError
         number = float(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be {kind}, but is {value!r}; pass {kind}.") from error

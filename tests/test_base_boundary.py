@@ -73,6 +73,14 @@ def test_impossible_polylines_are_refused(name, line, sentence):
         Boundary(**{**square(), name: line})
 
 
+def test_a_side_that_the_shared_corners_shrink_to_a_point_is_refused():
+    sides = square()
+    sides["v1"] = np.linspace(sides["v0"][0], sides["v1"][-1], 7)
+    sides["u0"] = np.stack([sides["v0"][0], sides["v0"][0] + 1e-8])
+    with pytest.raises(ValueError, match="u0 has length zero"):
+        Boundary(**sides)
+
+
 def test_a_grid_of_one_row_is_refused():
     with pytest.raises(ValueError, match="at least 2 x 2"):
         Boundary.from_grid(np.ones((1, 5, 3)))

@@ -60,6 +60,30 @@ def test_a_flat_square_keeps_its_coordinates_at_eight_to_one_density():
     np.testing.assert_allclose(v, points[:, 1], atol=0.02)
 
 
+def test_a_hole_keeps_its_size_and_the_surface_goes_on_across_it():
+    points = np.random.default_rng(3).random((1200, 2))
+    holed = points[np.hypot(*(points - 0.5).T) > 0.3]
+    u, v = jf.meshless_parameters(holed, square(), reweightings=0)
+    np.testing.assert_allclose(u, holed[:, 0], atol=0.02)
+    np.testing.assert_allclose(v, holed[:, 1], atol=0.02)
+    cloud, boundary = bump(1500)
+    cloud = cloud[np.hypot(cloud[:, 0] - 0.5, cloud[:, 1] - 0.5) > 0.3]
+    surface = jf.base_surface(boundary, cloud, NET, method=jf.Meshless())
+    s = np.linspace(0, 1, 60)
+    up = np.asarray(surface.normal(*np.meshgrid(s, s, indexing="ij")))[..., 2]
+    assert up.min() > 0.2
+
+
+def test_neighbours_behind_one_another_do_not_depend_on_rounding():
+    points = np.stack(np.meshgrid(*2 * [np.arange(9.0)], indexing="ij"), -1).reshape(-1, 2)
+    points = points[np.random.default_rng(0).random(len(points)) < 0.8]
+    expected = [set(x[f]) for x, f in zip(*stars(points, 20)[:2], strict=True)]
+    for angle in (0.3, 1.1, 2.0):
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        turned = stars(points @ turn.T, 20)
+        assert [set(x[f]) for x, f in zip(*turned[:2], strict=True)] == expected
+
+
 def test_boundary_vertices_and_duplicates_get_what_they_must():
     points, boundary = bump(300)
     u0 = np.asarray(boundary.u0)
@@ -114,6 +138,18 @@ def test_order_of_points_and_place_do_not_matter():
     moved = jax.tree.map(lambda x: 300 * x @ turn.T + 1e3, boundary)
     there = (nets(300 * points @ turn.T + 1e3, moved) - 1e3) @ turn / 300
     np.testing.assert_allclose(there, net, atol=1e-9)
+
+
+def test_how_far_out_control_points_may_lie_does_not_depend_on_the_axes():
+    arrays = helpers.data("blade_wrap_3000")
+    sides = {key[-2:]: x for key, x in arrays.items() if key.startswith("boundary_")}
+    turn = np.array([[np.sqrt(0.75), -0.5, 0.0], [0.5, np.sqrt(0.75), 0.0], [0.0, 0.0, 1.0]])
+    found = []
+    for turned in (np.eye(3), turn):
+        boundary = jf.Boundary(**{name: x @ turned.T for name, x in sides.items()})
+        base = jf.base_surface(boundary, arrays["points"] @ turned.T, (16, 16), method=jf.Meshless())
+        found.append(np.asarray(base.control_points) @ turned)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9 * helpers.diagonal(arrays["points"]))
 
 
 def test_coordinates_in_the_millions():

@@ -21,6 +21,7 @@ FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are s
 
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here for a method that looks at the cloud
 MOST_CONTROL_POINTS = 64  # per direction, likewise
+LARGEST_NET = 10_000_000  # control points in all: a fit of more would not fit in memory
 
 
 @eager_where_concrete
@@ -88,6 +89,7 @@ def base_surface(
     Sources: paper sections 2.3 and 4.1, equations (5)-(7), Algorithm 1 for curves.
     """
     order, net = _checked(boundary, net, order, tolerance)
+    check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     sides = [np.asarray(x) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
     dtype, dimension = sides[0].dtype, sides[0].shape[1]
@@ -192,6 +194,11 @@ def _checked(
         raise ValueError(
             f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
             f"is {net[0]} x {net[1]}; enlarge it or lower the order."
+        )
+    if net[0] * net[1] > LARGEST_NET:
+        raise ValueError(
+            f"net must have at most {LARGEST_NET} control points, but {net[0]} x {net[1]} are asked "
+            "for; lower it."
         )
     return order, net
 

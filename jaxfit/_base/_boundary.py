@@ -109,16 +109,21 @@ def _cleaned(lines: dict[str, np.ndarray], tolerance: float) -> dict[str, np.nda
     magnitude = max(float(np.abs(x).max()) for x in lines.values())
     eps = float(jnp.finfo(lines["v0"].dtype).eps)
     rounding, size = 4 * eps * magnitude, diagonal(*lines.values())
+    _check_lengths(lines, rounding)
+    _check_corners(lines, max(tolerance * size, rounding), size)
+    for v, v_end, u, u_end in _CORNERS:
+        lines[u][u_end] = lines[v][v_end]
+    _check_lengths(lines, rounding)  # a side within the tolerance may have shrunk to a point
+    return {name: _without_repeats(line, 4 * eps * size) for name, line in lines.items()}
+
+
+def _check_lengths(lines: dict[str, np.ndarray], rounding: float) -> None:
     for name, line in lines.items():
         if diagonal(line) <= rounding:
             raise ValueError(
                 f"{name} has length zero; patches with three sides are not supported, so cut "
                 "the tip off or give a polyline of distinct points."
             )
-    _check_corners(lines, max(tolerance * size, rounding), size)
-    for v, v_end, u, u_end in _CORNERS:
-        lines[u][u_end] = lines[v][v_end]
-    return {name: _without_repeats(line, 4 * eps * size) for name, line in lines.items()}
 
 
 def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:

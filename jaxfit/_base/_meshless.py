@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base._cloud import Cloud, thinned
+from jaxfit._base._host_splines import Frame
 from jaxfit._base._meshless_parameters import parameters_of
 from jaxfit._base._method import AbstractBaseMethod, Knots
 from jaxfit._base._reparametrise import along_sides
@@ -14,6 +15,7 @@ from jaxfit._checks import check_number
 
 FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
 STIFFENINGS = 12  # most rises of the smoothing
+UNFOLDINGS = 2  # of which so many at most because of folds where there are no points
 
 
 class Meshless(AbstractBaseMethod):
@@ -39,7 +41,7 @@ class Meshless(AbstractBaseMethod):
         $\lambda$, as a multiple of the ratio of the traces of the two matrices (default 1e-5, at least
         1e-10). Where there are no points, the thin plate alone decides. It is raised tenfold as long as
         control points lie twice as far out as any point: where points crowd in a corner of the domain, a
-        slack plate would shoot out beside them.
+        slack plate would shoot out beside them; and up to twice if that removes folds across a hole.
     robust : int
         Rounds in which points lose weight, $w = 1 / (1 + (r / 20 \bar r)^2)$ with r their distance and
         $\bar r$ the median (default 3), so that gross outliers do not pull.
@@ -84,11 +86,32 @@ class Meshless(AbstractBaseMethod):
         points = thinned(cloud.points, self.most_points)
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
-        most = FARTHEST * max(float(np.abs(x).max()) for x in (points, *cloud.sides))
-        smoothing = self.smoothing
-        for _ in range(STIFFENINGS):
+        most = FARTHEST * max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
+        tame: list[np.ndarray] = []
+        for power in range(STIFFENINGS):
+            smoothing = self.smoothing * 10.0**power
             found = robust_held_fit(net, knots, order, places, points, smoothing, self.robust)
-            if np.abs(found).max() <= most:
+            if np.linalg.norm(found, axis=-1).max() > most:
+                continue
+            if not _folds_across_gaps(found, knots, order, places):
+                return found
+            tame.append(found)
+            if len(tame) > UNFOLDINGS:
                 break
-            smoothing *= 10
-        return found
+        return tame[0] if tame else found
+
+
+def _folds_across_gaps(
+    net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], places: Float[Any, "points 2"]
+) -> bool:
+    """Whether normals turn over where there are no points: a slack plate overshoots what its rim has."""
+    if net.shape[2] != 3:
+        return False
+    breaks = [np.unique(k) for k in knots]
+    empty = np.histogram2d(places[:, 0], places[:, 1], bins=breaks)[0] == 0
+    samples = [np.sort(np.concatenate([x[:-1] + t * np.diff(x) for t in (0.25, 0.75)])) for x in breaks]
+    normals = Frame(knots, order, *samples).normals(net)
+    there = empty.repeat(2, axis=0).repeat(2, axis=1)
+    along_u = (np.sum(normals[1:] * normals[:-1], axis=2) < 0) & there[1:] & there[:-1]
+    along_v = (np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < 0) & there[:, 1:] & there[:, :-1]
+    return bool(along_u.any() or along_v.any())

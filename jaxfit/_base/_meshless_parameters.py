@@ -54,9 +54,9 @@ def meshless_parameters(
     boundary : Boundary
         Four polylines. Nodes are added to sides whose edges are longer than the cloud's spacing.
     neighbours : int
-        At least 6 (default 16): among how many of the nearest points the star is looked for.
+        At least 6 (default 24): among how many of the nearest points the star is looked for.
     reweightings : int
-        Most reweightings by stretch (default 8); 0 for the linear system alone.
+        Most reweightings by stretch (default 4); 0 for the linear system alone.
 
     Returns
     -------
@@ -71,7 +71,8 @@ def meshless_parameters(
 
     Notes
     -----
-    Duplicates count once. Groups of points whose neighbours are all their own are tied to the nearest
+    Duplicates count once. Points around a hole look for neighbours across it as well, so that it keeps its
+    size. Groups of points whose neighbours are all their own are tied to the nearest
     point outside. A point outside the boundary gets parameters inside the square, near those of its
     neighbours. Results do not depend on the order of points, nor, beyond rounding, on translation, rotation
     and scale.
@@ -105,7 +106,7 @@ def parameters_of(
     """The same for distinct points and sides of size one."""
     nodes = _nodes(points, sides)
     pinned = len(nodes.fixed)
-    star = stars(nodes.points, neighbours)
+    star = stars(nodes.points, neighbours, pinned)
     weights = mean_value_weights(star)
     places = _solved(nodes, star, weights)
     for _ in range(UNLINKINGS):

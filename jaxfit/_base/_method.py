@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from jaxfit._base._cloud import Cloud
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae
+from jaxfit._checks import check_kind
 
 Knots = tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]]
 
@@ -34,6 +35,9 @@ class Coons(eqx.Module):
     """
 
     abscissae: AbstractAbscissae = GREVILLE
+
+    def __check_init__(self) -> None:
+        check_kind("abscissae", self.abscissae, AbstractAbscissae, "Greville()")
 
 
 def refined(

@@ -16,10 +16,12 @@ from jaxfit._base._normals import frames, oriented
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many
 WIDTH = 4  # times the neighbours asked for: the most that symmetry may add
-COCIRCULAR = 1e-7  # sine of a turn of the hull that still counts as straight on
+COCIRCULAR = 1e-7  # sine of a turn of the hull that still counts as straight on, or as none
 STEEP = 3  # powers of the cosine that a step out of the plane is lengthened by
 LEAST = 0.05  # the least such cosine
 WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than this
+ACROSS = 1000  # points with a wide gap that may be neighbours across it
+ENTRIES = 1 << 20  # of arrays at once, when those are looked for
 
 
 class Stars(NamedTuple):
@@ -31,15 +33,70 @@ class Stars(NamedTuple):
     angle: Float[Any, "points width"]  # from each to the next, at most 2 pi
 
 
-def stars(points: Float[Any, "points d"], count: int) -> Stars:
-    """The stars among about `count` neighbours, d >= 2; no two points may coincide."""
+class _Planes(NamedTuple):
+    """Points with the axes of their tangent planes, and in space normals to one side."""
+
+    points: np.ndarray  # (points, d)
+    axes: np.ndarray  # (points, d, 2)
+    normals: np.ndarray | None  # (points, 3)
+
+
+def stars(points: Float[Any, "points d"], count: int, pinned: int = 0) -> Stars:
+    """The stars among about `count` neighbours, d >= 2; no two points may coincide.
+
+    Those with a wide gap, but of the first `pinned` points, are looked for once more among all that have one:
+    across a hole its rim's points are neighbours, or the hole would grow.
+    """
     members, filled = neighbourhoods(points, count)
-    plane = _unrolled(points, members, filled)
+    planes = _planes(points, members, filled)
+    star = _among(planes, np.arange(len(points)), members, filled)
+    gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
+    rows = gaping[gaping >= pinned]
+    at_once = max(ENTRIES // min(len(gaping) + 1, ACROSS), 1)
+    for k in range(0, len(rows), at_once):
+        part = rows[k : k + at_once]
+        members, filled = _with(star, points, part, gaping)
+        star = _replaced(star, part, _among(planes, part, members, filled))
+    return star
+
+
+def _among(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
+    """The stars of the points `rows` among given ones."""
+    plane = _unrolled(planes, rows, members, filled)
     angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
     order = np.argsort(angle, axis=1, kind="stable")
     members, filled, plane = _taken((members, filled, plane), order)
     members, filled, plane = _hulls(members, filled, plane)
     return Stars(members, filled, plane, _gaps(plane, filled))
+
+
+def _with(
+    star: Stars, points: np.ndarray, rows: np.ndarray, others: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The members of these stars, and the nearest of the `others` that are not among them."""
+    from scipy.spatial import cKDTree
+
+    near = cKDTree(points[others]).query(points[rows], min(len(others), ACROSS))[1]
+    near = others[near.reshape(len(rows), -1)]
+    members, filled = star.members[rows], star.filled[rows]
+    known = near == rows[:, None]
+    for k in range(members.shape[1]):
+        known |= filled[:, k, None] & (near == members[:, k, None])
+    return np.concatenate([members, near], axis=1), np.concatenate([filled, ~known], axis=1)
+
+
+def _replaced(star: Stars, rows: np.ndarray, part: Stars) -> Stars:
+    """With other stars of some points; all as wide as the widest."""
+    width = max(star.members.shape[1], part.members.shape[1])
+
+    def both(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        old, new = (
+            np.pad(x, [(0, 0), (0, width - x.shape[1])] + [(0, 0)] * (x.ndim - 2)) for x in (old, new)
+        )
+        old[rows] = new
+        return old
+
+    return Stars(*(both(old, new) for old, new in zip(star, part, strict=True)))
 
 
 def neighbourhoods(
@@ -74,24 +131,36 @@ def neighbourhoods(
     return members, filled
 
 
-def _unrolled(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> np.ndarray:
+def _planes(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> _Planes:
+    far, unit = _directions(points, np.arange(len(points)), members, filled)
+    nearest = np.where(filled, far, np.inf).min(axis=1, keepdims=True)
+    axes = frames(unit, np.where(filled, nearest / far, 0.0))
+    normals = oriented(axes[:, :, 0], unit, members, filled) if points.shape[1] == 3 else None
+    return _Planes(points, axes[:, :, -2:], normals)
+
+
+def _directions(
+    points: np.ndarray, rows: np.ndarray, members: np.ndarray, filled: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and unit directions of the neighbours of the points `rows`."""
+    steps = points[members] - points[rows][:, None]
+    far = np.where(filled, np.linalg.norm(steps, axis=2), 1.0)
+    return far, np.where(filled[..., None], steps / far[..., None], 0.0)
+
+
+def _unrolled(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> np.ndarray:
     """Neighbours in the tangent plane: the direction is projected, the distance kept or lengthened.
 
     It is divided by the cosine of the slope of the step, `STEEP` times over, and likewise where the normals
     point away from each other: a point on the sheet below is as near as those beside, and must be
     farther; on a ridge, where there are no others, it stays a neighbour.
     """
-    steps = points[members] - points[:, None]
-    far = np.where(filled, np.linalg.norm(steps, axis=2), 1.0)
-    unit = np.where(filled[..., None], steps / far[..., None], 0.0)
-    nearest = np.where(filled, far, np.inf).min(axis=1, keepdims=True)
-    axes = frames(unit, np.where(filled, nearest / far, 0.0))
-    flat = unit @ axes[:, :, -2:]
+    far, unit = _directions(planes.points, rows, members, filled)
+    flat = unit @ planes.axes[rows]
     length = np.linalg.norm(flat, axis=2)
     cosine = np.maximum(length, LEAST)
-    if points.shape[1] == 3:
-        normals = oriented(axes[:, :, 0], unit, members, filled)
-        agree = 1 + np.sum(normals[members] * normals[:, None], axis=2)
+    if planes.normals is not None:
+        agree = 1 + np.sum(planes.normals[members] * planes.normals[rows][:, None], axis=2)
         cosine = cosine * np.clip(agree, LEAST, 1.0)
     return flat * (far / (np.where(length > 0, length, 1.0) * cosine**STEEP))[..., None]
 
@@ -112,9 +181,11 @@ def _hulls(
         part, there = flipped[rows], filled[rows]
         before, after = around(part, there)
         turn = _cross(part - before, after - part)
-        size = np.linalg.norm(part - before, axis=2) * np.linalg.norm(after - part, axis=2)
+        size = _norm(part - before) * _norm(after - part)
         # Across half a turn or more there is no triangle that could hide the point.
-        dropped = there & (_cross(before, after) > 0) & (turn < -COCIRCULAR * size)
+        opposite = _cross(before, after) <= COCIRCULAR * _norm(before) * _norm(after)
+        dropped = there & ((~opposite & (turn < -COCIRCULAR * size)) | _behind(part, before))
+        dropped |= there & _behind(part, after)
         # A point whose two neighbours are one and the same stays.
         dropped &= (there.sum(axis=1) > 2)[:, None]
         changed = dropped.any(axis=1)
@@ -133,6 +204,17 @@ def around(
     count = np.maximum(filled.sum(axis=1), 1)[:, None]
     place = np.arange(filled.shape[1])[None, :]
     return [_taken((x,), (place + shift) % count)[0] for shift in (-1, 1)]
+
+
+def _behind(x: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Whether x, inverted, is in the same direction as the other, and was farther away."""
+    size = _norm(x) * _norm(other)
+    along = (np.abs(_cross(x, other)) <= COCIRCULAR * size) & (np.sum(x * other, axis=-1) > 0)
+    return along & (_norm(x) < _norm(other))
+
+
+def _norm(x: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(x, axis=-1)
 
 
 def _cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
