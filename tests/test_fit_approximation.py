@@ -1,5 +1,8 @@
 """Algorithm 1, plain: each step is the paper's, errors are true distances, and nothing is NaN."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,6 +174,35 @@ def test_impossible_methods_get_a_sentence(options, sentence):
         jf.GeometricApproximation(**options)
 
 
+def test_local_mode_goes_on_to_the_average_once_the_maximum_is_met(base):
+    begun = jf.approximate(POINTS, base, max_steps=0)
+    tolerances = dict(tol_average=0.1 * float(begun.average_error), tol_maximum=float(begun.maximum_error))
+    fit = jf.approximate(POINTS, base, jf.GeometricApproximation(local=True), **tolerances)
+    assert fit.converged
+    assert fit.average_error <= tolerances["tol_average"]
+
+
+def test_parts_of_methods_that_are_no_objects_get_a_sentence():
+    # In a session of its own: here the types of fields are checked before the sentence comes.
+    wrong = [
+        (kind, part)
+        for kind in ("GeometricApproximation", "StandardApproximation", "OrthogonalDistance")
+        for part in ("insertion=True", "insertion=jf.KnotInsertion", "foot_method='newton'")
+    ]
+    wrong += [
+        ("GeometricApproximation", f"{x}='yes'") for x in ("fairing", "acceleration", "local", "foresee")
+    ]
+    lines = ["import jaxfit as jf"]
+    for kind, part in wrong:
+        lines += ["try:", f"    jf.{kind}({part})", "except TypeError as error:", "    print(error)"]
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True
+    )
+    told = done.stdout.splitlines()
+    for (_, part), line in zip(wrong, told, strict=True):
+        assert line.startswith(f"{part.split('=')[0]} must be")
+
+
 @pytest.mark.parametrize("options", [{"every": 0}, {"gamma": -1.0}])
 def test_impossible_fairing_gets_a_sentence(options):
     with pytest.raises(ValueError, match="must be"):
@@ -299,12 +331,25 @@ def test_the_whole_way_from_a_cloud_with_its_boundary():
         ({"weights": -np.ones(500)}, "weights must not be negative"),
         ({"start": (np.zeros(3), np.zeros(3))}, "start must hold a u and a v for each"),
         ({"start": np.zeros(500)}, "start must be a pair"),
+        ({"start": (np.full(500, 0.5), np.full(500, 7.0))}, "start v must lie in the domain"),
     ],
 )
 def test_bad_input_gets_a_sentence(base, change, sentence):
     arguments = {"points": POINTS, "base": base} | change
     with pytest.raises(ValueError, match=sentence):
         jf.approximate(**arguments)
+
+
+def test_what_a_fit_cannot_do_is_said_before_there_is_a_base_surface(monkeypatch):
+    monkeypatch.setattr("jaxfit._fit._fit_points.chosen_base", None)
+    for change, sentence in (
+        ({"points": np.ones((9, 3))}, "must not all coincide"),
+        ({"points": POINTS[:, :2]}, "points must have 3 coordinates"),
+        ({"weights": -np.ones(500)}, "weights must not be negative"),
+        ({"max_steps": -1}, "max_steps must be"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            jf.fit_points(**({"points": POINTS, "boundary": BOUNDARY} | change))
 
 
 def test_a_cloud_without_a_boundary_gets_a_sentence():

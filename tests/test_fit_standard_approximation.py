@@ -192,7 +192,14 @@ def test_the_discrepancy_principle_stops_at_the_noise():
     smoothing = jnp.asarray([1e-3, 1e-2, 1e-1])
     found = Candidates(smoothing, jnp.asarray([1.0, 4.0, 16.0]), smoothing, jnp.asarray(400.0))
     assert abs(float(jf.Discrepancy(noise=0.1).best(found)) - 1e-2) < 1e-6
-    assert abs(float(jf.Discrepancy(noise=1e-9).best(found)) - 1e-3) < 1e-6
+
+
+def test_noise_that_no_lambda_reaches_is_left_to_cross_validation():
+    smoothing, effective = jnp.asarray([1e-4, 1e-3, 1e-2, 1e-1]), jnp.asarray([300.0, 200.0, 10.0, 1.0])
+    found = Candidates(smoothing, jnp.asarray([1.0, 1.0, 1.1, 16.0]), effective, jnp.asarray(400.0))
+    chosen = float(jf.Discrepancy(noise=1e-3).best(found))
+    assert 2e-3 < chosen < 5e-2
+    assert chosen == float(jf.GeneralizedCrossValidation().best(found))
 
 
 def test_impossible_rules_get_a_sentence():

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +11,8 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxfit._checks import (
-    as_floating,
     as_points,
     check_kind,
-    check_number,
-    check_steps,
     eager_where_concrete,
     is_concrete,
 )
@@ -23,16 +21,15 @@ from jaxfit._fit._fit_result import Fit, Name, converged_or_raise, history_of
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._global_feet import global_feet
 from jaxfit._fit._growth import cut, with_room
-from jaxfit._fit._loop import Carry, Limits, begin, result_of, run
-from jaxfit._fit._orthogonal_distance import OrthogonalDistance
-from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start, unit_of
+from jaxfit._fit._loop import Carry, Limits, begin, code_of, result_of, run
+from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start
+from jaxfit._fit._request import ApproximationMethod, checked_request
+from jaxfit._fit._results import RESULTS
 from jaxfit._fit._standard_approximation import StandardApproximation, bending_energy, with_smoothing
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
 LEAST_POINTS = 4
-
-ApproximationMethod = GeometricApproximation | OrthogonalDistance | StandardApproximation
 
 
 @eager_where_concrete
@@ -84,8 +81,8 @@ def approximate(
     Raises
     ------
     ValueError
-        If points, weights or start have the wrong shape or are not finite, there are fewer than four
-        points, or all of them coincide.
+        If points, weights or start have the wrong shape or are not finite, start lies outside the domain,
+        there are fewer than four points, or all of them coincide.
 
     Notes
     -----
@@ -94,18 +91,25 @@ def approximate(
     sizes per octave, so that a second cloud of similar size compiles nothing.
     """
     method = GeometricApproximation() if method is None else method
-    check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
-    check_steps("max_steps", max_steps)
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
     cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
-    pulls = _checked_weights(weights, cloud.shape[0])
+    unit, pulls, feet = checked_request(
+        cloud,
+        base.domain,
+        method=method,
+        tol_average=tol_average,
+        tol_maximum=tol_maximum,
+        max_steps=max_steps,
+        weights=weights,
+        start=start,
+        progress=progress,
+        throw=throw,
+    )
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
-            check_number("tol_average and tol_maximum", tolerance, 0.0)
             advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
-    unit = unit_of(cloud)
     concrete = is_concrete(cloud, base, pulls, start, tol_average, tol_maximum, method)
     axes = axes_of(base, dtype)
     problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
@@ -118,25 +122,38 @@ def approximate(
     if method.insertion is not None:
         knots = base.knots_u.astype(dtype), base.knots_v.astype(dtype)
         net, growth = with_room(net, knots, axes, method.insertion.room(max_steps))
-    if start is not None:
-        u, v = _checked_start(start, cloud.shape[0])
+    if feet is not None:
+        u, v = feet
     elif concrete:
         u, v, _, _ = global_feet(_projector(method), problem, net, growth, cloud.shape[0], max_steps)
     else:
-        feet = closest_point(base, cloud)
-        u, v = feet.u, feet.v
+        nearest = closest_point(base, cloud)
+        u, v = nearest.u, nearest.v
     u, v = (padded_start(x, size, dtype) for x in (u, v))
     if isinstance(method, StandardApproximation):
         problem = with_smoothing(rule, method, problem, begun, u, v)
-    average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
-    limits = Limits(average, maximum, jnp.asarray(max_steps, jnp.int32))
+    limits, wrong = _limits(tol_average, tol_maximum, max_steps, problem)
     together = order_by_cell(axes, u, v, cloud.shape[0])
     carry = begin(method, net, u[together], v[together], max_steps, problem, growth)
     carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
+    if wrong is not None:
+        code = jnp.where(wrong, np.int32(code_of(RESULTS.diverged)), carry.code)
+        carry = eqx.tree_at(lambda c: c.code, carry, code)
     surface = _surface(carry, base, begun, unit)
     parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
     fit = _finished(carry, method, problem, parts, unit, surface, concrete)
     return converged_or_raise(fit) if throw else fit
+
+
+def _limits(tol_average: Any, tol_maximum: Any, max_steps: int, problem: Problem) -> tuple[Limits, Any]:
+    """When to stop: at once if a traced lambda is none. The second value says so: it counts as divergence."""
+    dtype, smoothing = problem.target.dtype, problem.smoothing
+    average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
+    most = jnp.asarray(max_steps, jnp.int32)
+    if smoothing is None or is_concrete(smoothing):
+        return Limits(average, maximum, most), None
+    wrong = ~(jnp.isfinite(smoothing) & (smoothing >= 0))
+    return Limits(average, maximum, jnp.where(wrong, 0, most)), wrong
 
 
 def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
@@ -185,7 +202,8 @@ def _parts(
     together = problem.ordered(order)
     best = global_feet(projector, together, carry.net, carry.growth, count, max_steps, known)
     distance = best[2] / float(problem.diagonal)
-    nearer = best[3] & ((distance < distances * (1 - 1e-6)) | ~found)
+    # A foot that has not converged is still on the surface: the distance is no less for that.
+    nearer = best[3] & (distance <= distances * np.where(found, 1 - 1e-6, 1.0))
     for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
         old[nearer] = new[nearer]
     place = np.argsort(order[:count])
@@ -240,31 +258,3 @@ def _smoothing_stats(carry: Carry, problem: Problem, unit: Unit) -> dict[str, An
     if trust is None:
         return stats | {"shift": carry.next.shift}
     return stats | {"damping": trust.damping, "retreats": trust.retreats}
-
-
-def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
-    if weights is None:
-        return None
-    pulls = as_floating("weights", weights, 1)
-    if pulls.shape[0] != count:
-        raise ValueError(
-            f"weights must hold one number for each of the {count} points, but has shape "
-            f"{pulls.shape}; give both the same length."
-        )
-    if is_concrete(pulls) and (np.asarray(pulls).min() < 0 or not np.asarray(pulls).any()):
-        raise ValueError(
-            "weights must not be negative and not all zero; give each point a weight of 0 or more."
-        )
-    return pulls
-
-
-def _checked_start(start: Any, count: int) -> tuple[Any, Any]:
-    if not isinstance(start, (tuple, list)) or len(start) != 2:
-        raise ValueError("start must be a pair (u, v) of parameter arrays; pass start=(u, v).")
-    u, v = (as_floating(f"start {name}", x, 1) for name, x in zip("uv", start, strict=True))
-    if u.shape[0] != count or v.shape[0] != count:
-        raise ValueError(
-            f"start must hold a u and a v for each of the {count} points, but their shapes are "
-            f"{u.shape} and {v.shape}; give one pair per point."
-        )
-    return u, v

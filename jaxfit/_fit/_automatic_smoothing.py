@@ -69,20 +69,14 @@ class GeneralizedCrossValidation(AbstractSmoothing):
 
     def best(self, candidates: Candidates) -> Float[Array, ""]:
         """The minimum, interpolated."""
-        left = 1.0 - candidates.effective / candidates.points
-        score = jnp.log(candidates.remaining) - 2.0 * jnp.log(jnp.maximum(left, 1e-3))
-        last = score.shape[0] - 1
-        k = jnp.clip(jnp.argmin(score), 1, last - 1)
-        low, middle, high = score[k - 1], score[k], score[k + 1]
-        bend = low - 2.0 * middle + high
-        offset = jnp.where(bend > 0, 0.5 * (low - high) / jnp.where(bend > 0, bend, 1.0), 0.0)
-        logarithm = jnp.log(candidates.smoothing)
-        step = logarithm[1] - logarithm[0]
-        return jnp.exp(logarithm[k] + jnp.clip(offset, -1.0, 1.0) * step)
+        return _cross_validated(candidates)
 
 
 class Discrepancy(AbstractSmoothing):
     """The largest lambda that leaves no more than the noise: the discrepancy principle of Morozov.
+
+    Where even the least leaves more, the net and not lambda sets what remains, and the principle is silent:
+    then as `GeneralizedCrossValidation` chooses.
 
     Parameters
     ----------
@@ -102,10 +96,23 @@ class Discrepancy(AbstractSmoothing):
         _check_counts(self)
 
     def best(self, candidates: Candidates) -> Float[Array, ""]:
-        """Where the remaining sum of squares passes that of the noise; the least lambda if it never does."""
+        """Where the remaining sum of squares passes that of the noise."""
         goal = jnp.log(candidates.points) + 2.0 * np.log(max(self.noise, 1e-30))
         remaining = lax.cummax(jnp.log(candidates.remaining))
-        return jnp.exp(jnp.interp(goal, remaining, jnp.log(candidates.smoothing)))
+        passed = jnp.exp(jnp.interp(goal, remaining, jnp.log(candidates.smoothing)))
+        return jnp.where(remaining[0] <= goal, passed, _cross_validated(candidates))
+
+
+def _cross_validated(candidates: Candidates) -> Float[Array, ""]:
+    left = 1.0 - candidates.effective / candidates.points
+    score = jnp.log(candidates.remaining) - 2.0 * jnp.log(jnp.maximum(left, 1e-3))
+    k = jnp.clip(jnp.argmin(score), 1, score.shape[0] - 2)
+    low, middle, high = score[k - 1], score[k], score[k + 1]
+    bend = low - 2.0 * middle + high
+    offset = jnp.where(bend > 0, 0.5 * (low - high) / jnp.where(bend > 0, bend, 1.0), 0.0)
+    logarithm = jnp.log(candidates.smoothing)
+    step = logarithm[1] - logarithm[0]
+    return jnp.exp(logarithm[k] + jnp.clip(offset, -1.0, 1.0) * step)
 
 
 def _check_counts(rule: Any) -> None:

@@ -7,8 +7,9 @@ from jax.typing import ArrayLike
 
 from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, chosen_base
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
-from jaxfit._fit._approximate import LEAST_POINTS, ApproximationMethod, approximate
+from jaxfit._fit._approximate import LEAST_POINTS, approximate
 from jaxfit._fit._fit_result import Fit
+from jaxfit._fit._request import ApproximationMethod, checked_request
 
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
 MOST_CONTROL_POINTS = 64  # per direction, likewise
@@ -58,7 +59,8 @@ def fit_points(
             "four polylines around the patch."
         )
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
-    cloud = as_points("points", points, least=LEAST_POINTS)
+    cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
+    checked_request(cloud, method=method, **options)
     net = _default_net(cloud.shape[0], boundary, order) if net is None else net
     if base is None and is_concrete(cloud):
         begun = chosen_base(boundary, np.asarray(cloud), net, order)

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from jaxfit._checks import check_kind
 from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._foot_moves import Follow, Stay
-from jaxfit._fit._growth import KnotInsertion
+from jaxfit._fit._growth import KnotInsertion, check_insertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._losses import check_loss, loss_length, reweighted
 from jaxfit._fit._measure import border_on, measure_feet
@@ -57,9 +58,10 @@ class GeometricApproximation(AbstractIterativeMethod):
     fairing : Fairing(), optional
         Laplacian fairing of the net every few iterations (section 4.3); none by default.
     local : bool, default False
-        Go on only where the error exceeds the tolerance on the maximum error, or on the average error where
-        there is none (section 4.1): control points move that have influence on a point which has been so far
-        away, now or before; the others stay to the last bit, and points that do not feel the move rest.
+        Go on only where the error exceeds the tolerance on the maximum error, or where that is met or not
+        given, the tolerance on the average error (section 4.1): control points move that have influence on a
+        point which has been so far away, now or before; the others stay to the last bit, and points that do
+        not feel the move rest.
     loss : Huber(), Tukey() or GemanMcClure(), optional
         For points with outliers, which are weighed anew in each iteration; least squares by default.
     foot_method : Newton() or HuWallner()
@@ -125,6 +127,13 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     def __check_init__(self) -> None:
         check_loss(self.loss)
+        check_insertion(self.insertion)
+        for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
+            if getattr(self, name) is not None:
+                check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
+        for name in ("fixed_boundary", "foresee", "local"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be True or False, but is {getattr(self, name)!r}; pass either.")
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
         if not 0 < self.relaxation < most:
             raise ValueError(
@@ -205,13 +214,15 @@ class GeometricApproximation(AbstractIterativeMethod):
         here, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
         poor = None
         if self.local:
-            poor = measured.poor | (~idle & (here.error > self._threshold(limits) * problem.diagonal))
+            errors = jnp.where(idle, 0.0, here.error) / problem.diagonal
+            poor = measured.poor | (errors > _threshold(limits, jnp.max(errors)))
             # Sums are complete where all points were looked at, or those that feel what was touched before.
             after = region_of(pieces, here.u, here.v, poor)
             touched = jnp.where(exact, after.touched, before.touched)
             pulls = Pulls(jnp.where(touched[..., None], pulls.sums, 0.0))
         return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor, here.ahead)
 
-    def _threshold(self, limits: Limits) -> Array:
-        """The error beyond which a point is poor."""
-        return jnp.where(jnp.isfinite(limits.maximum), limits.maximum, limits.average)
+
+def _threshold(limits: Limits, maximum: Array) -> Array:
+    """The error beyond which a point is poor."""
+    return jnp.where(maximum <= limits.maximum, limits.average, limits.maximum)

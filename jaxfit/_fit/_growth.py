@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._checks import check_number
+from jaxfit._checks import check_kind, check_number
 from jaxfit._splines._pieces import Axis, make_axis
 
 
@@ -55,6 +55,12 @@ class KnotInsertion(eqx.Module):
     def room(self, max_steps: int) -> int:
         """Control points to be added along either direction at most."""
         return min(self.most, max_steps // self.every)
+
+
+def check_insertion(insertion: Any) -> None:
+    """When there are new knots, or None for never."""
+    if insertion is not None:
+        check_kind("insertion", insertion, KnotInsertion, "KnotInsertion()")
 
 
 class Growth(eqx.Module):

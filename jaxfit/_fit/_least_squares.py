@@ -62,8 +62,9 @@ class GaussNewton(AbstractLeastSquares):
         import optimistix as optx
 
         linear = StructuredSolver(problem)
-        solver: Any = optx.GaussNewton(1e-8, 1e-8, linear_solver=linear)
-        # The residual is linear, so the first step is the solution; it is not evaluated just to be accepted.
+        # The residual is linear, so the first step is the solution: nothing is measured to tell whether it is
+        # the last, and it is not evaluated just to be accepted.
+        solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
         return _freed(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
 
 

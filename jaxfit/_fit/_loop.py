@@ -16,7 +16,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._checks import check_number, is_concrete
+from jaxfit._checks import check_kind, check_number, is_concrete
+from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._ahead import Ahead
 from jaxfit._fit._growth import Growth
 from jaxfit._fit._nesterov import Momentum, at_rest
@@ -148,6 +149,7 @@ class AbstractIterativeMethod(eqx.Module):
 
     def __check_init__(self) -> None:
         check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_kind("foot_method", getattr(self, "foot_method", Newton()), AbstractFootMethod, "Newton()")
         check_number("stall_window", self.stall_window, 1, whole=True)
         check_number("stall_gain", self.stall_gain, 0.0)
 

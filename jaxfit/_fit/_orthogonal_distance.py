@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from jaxfit._cells import staged
 from jaxfit._checks import check_number
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._growth import Growth, KnotInsertion
+from jaxfit._fit._growth import Growth, KnotInsertion, check_insertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._fit._measure import border_on, measure_feet
@@ -20,7 +20,7 @@ from jaxfit._fit._normal_rows import NormalRows, normal_rows
 from jaxfit._fit._problem import check_smoothing
 from jaxfit._fit._second_order import second_order_pull
 from jaxfit._fit._trust import Trust, farthest_move, is_plausible, next_damping, within_reach
-from jaxfit._normal import Stencil, coupled_cg, preconditioner, thin_plate
+from jaxfit._normal import Stencil, coupled_cg, free_points, preconditioner, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
@@ -89,7 +89,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
     last mu; and `retreats`, how many steps were taken back.
 
     Far from the points the feet say little, and like the paper's methods this one may fold a surface whose
-    base is too far away. Where smoothing is 0, control points that few points see may travel far.
+    base is too far away, or whose net is too coarse for what it is asked; a base made with the points
+    (`Meshless`, `DynamicBaseSurface`) or a finer net is the remedy. Where smoothing is 0, control points that
+    few points see may travel far.
 
     This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
@@ -115,6 +117,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     def __check_init__(self) -> None:
         check_smoothing(self.smoothing)
         check_loss(self.loss)
+        check_insertion(self.insertion)
         if not 0 < self.damping <= 1:
             raise ValueError(
                 f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."
@@ -218,7 +221,7 @@ def _stepped(
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     scale = 1.0 + (net.shape[2] - 1) * damping
     uncoupled = Stencil(rows.matrix.trace.entries / scale).plus(stiffness, smoothing)
-    free = jnp.asarray(uncoupled.diagonal > 0) & ~held
+    free = free_points(uncoupled, held)
     right = rows.gradient - smoothing * plate.adjoint(plate.residual(net))
     right = jnp.where(free[:, :, None], right, 0.0)
     near = preconditioner(matrix, uncoupled, free)

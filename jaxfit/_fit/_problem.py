@@ -55,7 +55,10 @@ def check_smoothing(smoothing: Any) -> None:
     """Lambda is a finite number of at least 0, unless it is traced."""
     if not is_concrete(smoothing):
         return
-    value = np.asarray(smoothing, np.float64)
+    try:
+        value = np.asarray(smoothing, np.float64)
+    except (TypeError, ValueError):
+        value = np.asarray(np.nan)
     if value.ndim or not 0 <= value < np.inf:
         raise ValueError(
             f"smoothing must be a finite number of at least 0, but is {smoothing!r}; pass "

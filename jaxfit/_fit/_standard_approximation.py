@@ -12,7 +12,7 @@ from jaxfit._cells import values_at
 from jaxfit._checks import check_kind
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._automatic_smoothing import AbstractSmoothing, chosen
-from jaxfit._fit._growth import KnotInsertion
+from jaxfit._fit._growth import KnotInsertion, check_insertion
 from jaxfit._fit._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._losses import check_loss, loss_length, reweighted
@@ -32,7 +32,8 @@ class StandardApproximation(AbstractIterativeMethod):
 
     equations (8) and (10), then takes the closest points on the new surface as parameters, and so on. The
     domain counts as $[0, 1]^2$; lambda has no unit, and weighs against a plain sum over the points. Control
-    points that neither data nor smoothing reaches stay where they are.
+    points that neither data nor smoothing reaches, or hardly, stay where they are; without smoothing those
+    that few points see may travel far.
 
     Parameters
     ----------
@@ -62,8 +63,9 @@ class StandardApproximation(AbstractIterativeMethod):
     -----
     The fit's `stats` say `smoothing`, the lambda in force; `bending_energy`, the integral above in the
     squared unit of the data; and `shift`, by what share of its diagonal a normal matrix had to be shifted
-    because it was singular to rounding, as it is without smoothing where points are fewer than a net needs: 0
-    for a regular one.
+    because it was nearly singular, as it is without smoothing where points are fewer than a net needs: 0 for
+    a regular one. What is solved for is the correction of the present surface, so that what the data leaves
+    open stays as it is.
     """
 
     smoothing: Any = 2e-5
@@ -89,6 +91,7 @@ class StandardApproximation(AbstractIterativeMethod):
         if not isinstance(self.smoothing, AbstractSmoothing):
             check_smoothing(self.smoothing)
         check_loss(self.loss)
+        check_insertion(self.insertion)
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
         """With lambda moved into the problem, so that another one compiles nothing; 0 until it is chosen."""

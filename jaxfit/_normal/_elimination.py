@@ -17,16 +17,19 @@ from jaxtyping import Bool, Float
 
 from jaxfit._normal._stencil import Stencil
 
-# Pivots below so many rounding units, relative to the diagonal, count as zero; and the share of the diagonal
-# that is then added to it, which is enough to keep them away from there.
-LEAST_PIVOT = 1e3
-SHIFT = 1e5
+# Pivots below this share of the diagonal count as zero (with data enough they stay above 1e-5), and this
+# share is then added to it. Solved for are corrections, so the shift does not bias what a few of them come
+# to; a smaller one would let what the data does not determine grow by the inverse of its root.
+LEAST_PIVOT = 1e-8
+SHIFT = 1e-3
+FLOOR = 0.1  # of the greatest diagonal entry: where the own is less, the share is of this
+ROUNDING = (1e3, 1e5)  # the least of either in units of rounding, for single precision
 
 
 class Factors(eqx.Module):
     """By rows of the net: `inverse[i]` of block D of row i, and `below[i]`, the K - 1 blocks of X after it.
 
-    `shift` is the share of the diagonal that had to be added: 0 unless the matrix is singular to rounding.
+    `shift` is the share of the diagonal that had to be added: 0 unless the matrix is nearly singular.
     Where `turned`, the directions of the net are exchanged.
     """
 
@@ -39,24 +42,25 @@ class Factors(eqx.Module):
 def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
     """Factors of the matrix restricted to the free control points, the others having identity rows.
 
-    A matrix that is singular to rounding is shifted by a small multiple of its diagonal. Time
+    A matrix that is nearly singular is shifted by a small multiple of its diagonal. Time
     O(rows (K n)^2 n) and memory O(rows K n^2), n being the shorter side of the net.
     """
     turned = free.shape[1] > free.shape[0]
     if turned:
         stencil, free = stencil.transposed(), free.T
     entries = jnp.asarray(stencil.entries)
-    eps = jnp.finfo(entries.dtype).eps
+    eps = float(jnp.finfo(entries.dtype).eps)
+    smallest, added = max(LEAST_PIVOT, ROUNDING[0] * eps), max(SHIFT, ROUNDING[1] * eps)
     nu, nv = free.shape
     reach = (entries.shape[0] - 1) * nv
 
     def failed(carry: tuple[Any, Array, Array]) -> Array:
         (_, _, least), _, trials = carry
-        return ~(least > LEAST_PIVOT * eps) & (trials < 2)
+        return ~(least > smallest) & (trials < 2)
 
     def attempt(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         trials = carry[2]
-        shift = jnp.where(trials == 0, 0.0, SHIFT * eps).astype(entries.dtype)
+        shift = jnp.where(trials == 0, 0.0, added).astype(entries.dtype)
         return _factors(entries, free, shift), shift, trials + 1
 
     zero = jnp.zeros((), entries.dtype)
@@ -72,12 +76,14 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, A
     reach = (order - 1) * nv
     ahead = jnp.pad(free, ((0, order - 1), (0, 0)))
     unit = jnp.eye(nv, dtype=entries.dtype)
+    floor = FLOOR * jnp.max(entries[0, 0])
 
     def step(window: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array, Array]]:
         number, bands = row
         mask = lax.dynamic_slice_in_dim(ahead, number, order)
         column = jnp.where(mask[:, :, None] & mask[0][None, None, :], _blocks(bands), 0.0)
-        own = jnp.where(mask[0][:, None], column[0] * (1.0 + shift * unit), unit)
+        added = shift * unit * jnp.maximum(jnp.diagonal(column[0]), floor)[:, None]
+        own = jnp.where(mask[0][:, None], column[0] + added, unit)
         rest = column[1:].reshape(reach, nv) - jnp.pad(window[nv:, :nv], ((0, nv), (0, 0)))
         inverse, least = _inverted(own - window[:nv, :nv], jnp.diagonal(own))
         below = rest @ inverse

@@ -75,7 +75,7 @@ def _diagonal(operator: NormalOperator) -> Array:
 
 
 class BlockCholesky(lx.AbstractLinearSolver):
-    """Direct solution of a `NormalOperator`, by `factorise`; what is singular to rounding is shifted.
+    """Direct solution of a `NormalOperator`, by `factorise`; what is nearly singular is shifted.
 
     `stats["shift"]` is the share of the diagonal that had to be added, 0 for a regular matrix.
     """

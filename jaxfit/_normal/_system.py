@@ -29,6 +29,8 @@ from jaxfit._normal._stencil import Stencil
 from jaxfit._normal._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
+SCARCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
+
 Residual = tuple[Float[Array, "d rows width"], Bending]
 
 
@@ -103,7 +105,8 @@ def make_system(
 def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu nv"]:
     """Control points to solve for: not held, and reached by some point or by smoothing.
 
-    The others keep their value: those that no data touches when there is no smoothing, and surplus ones
-    behind repeated end knots.
+    The others keep their value: those that data touches at most with the far end of a basis function when
+    there is no smoothing, and would throw anywhere, and surplus ones behind repeated end knots.
     """
-    return (jnp.asarray(stencil.diagonal) > 0) & ~jnp.asarray(held)
+    reached = jnp.asarray(stencil.diagonal)
+    return (reached > SCARCE * jnp.max(reached)) & ~jnp.asarray(held)
