@@ -352,6 +352,11 @@ def test_what_a_fit_cannot_do_is_said_before_there_is_a_base_surface(monkeypatch
             jf.fit_points(**({"points": POINTS, "boundary": BOUNDARY} | change))
 
 
+def test_an_option_that_there_is_none_gets_a_sentence():
+    with pytest.raises(TypeError, match="tolerance is not an option of fit_points; pass any of tol_average"):
+        jf.fit_points(POINTS, BOUNDARY, tolerance=1e-4)
+
+
 def test_a_cloud_without_a_boundary_gets_a_sentence():
     with pytest.raises(ValueError, match="boundary must be given"):
         jf.fit_points(POINTS)

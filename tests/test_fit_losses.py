@@ -75,6 +75,28 @@ def test_outliers_do_not_spoil_the_other_methods(base, wild, method, steps):
     assert spoilt(method, base, wild, steps) < 1e-3
 
 
+@pytest.mark.parametrize("loss", LOSSES, ids=named)
+def test_detail_too_fine_for_the_net_is_no_outlier(loss):
+    rng = np.random.default_rng(0)
+    x, y = rng.random((2, 4000))
+    middles = rng.uniform(0.2, 0.8, (4, 2))
+    height = 3e-3 * sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / 0.002) for a, b in middles)
+    clean = np.stack([x, y, height], axis=1)
+    noisy = clean + 1e-4 * rng.normal(size=clean.shape)
+    noisy[:40, 2] += rng.uniform(0.1, 0.3, 40)
+    knots = jf.clamped_uniform_knots(16, 4)
+    places = jf.greville_abscissae(knots, 4)
+    flat = np.stack([*np.meshgrid(places, places, indexing="ij"), np.zeros((16, 16))], axis=-1)
+
+    def farthest(points, loss):
+        method = jf.StandardApproximation(smoothing=1e-8, loss=loss)
+        base = jf.BSplineSurface(flat, knots, knots)
+        fit = jf.approximate(points, base, method, tol_average=1e-9, max_steps=10)
+        return float(jnp.max(jf.closest_point(fit.surface, clean).distance))
+
+    assert farthest(noisy, loss) < 1.6 * farthest(clean, None)
+
+
 def test_outliers_spoil_least_squares(base, wild):
     assert spoilt(jf.GeometricApproximation(), base, wild, 60) > 3e-3
 

@@ -135,6 +135,16 @@ def test_without_parameter_correction_one_solve_is_the_fit(base, one):
     assert float(fit.average_error) <= float(fit.history.average[-1])
 
 
+def test_without_parameter_correction_errors_are_true_distances_inside_jit_too(base):
+    method = jf.StandardApproximation(smoothing=SMOOTHING, parameter_correction=False)
+    options = dict(tol_average=1e-6, max_steps=1)
+    fit = jax.jit(lambda points: jf.approximate(points, base, method, **options))(POINTS)
+    distance = jf.closest_point(fit.surface, POINTS).distance / fit.stats["diagonal"]
+    np.testing.assert_allclose(fit.errors, distance, atol=1e-9)
+    outside = jf.approximate(POINTS, base, method, **options)
+    assert abs(float(fit.average_error - outside.average_error)) < 1e-9
+
+
 def test_a_singular_system_is_shifted_and_says_so(base):
     few = POINTS[POINTS[:, 0] < 0.5][:20]
     method = jf.StandardApproximation(smoothing=0.0)

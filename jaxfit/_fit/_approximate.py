@@ -141,6 +141,9 @@ def approximate(
         carry = eqx.tree_at(lambda c: c.code, carry, code)
     surface = _surface(carry, base, begun, unit)
     parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
+    if not concrete and _projector(method) is not method:  # feet that have never moved
+        nearest = closest_point(surface, cloud)
+        parts = (nearest.u, nearest.v, nearest.distance / unit.diagonal, nearest.converged)
     fit = _finished(carry, method, problem, parts, unit, surface, concrete)
     return converged_or_raise(fit) if throw else fit
 

@@ -1,5 +1,6 @@
 """The verb for scattered points and the curves around them: a base surface, then a fit."""
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,10 @@ def fit_points(
     ------
     ValueError
         As `base_surface` and `approximate` do, and if there is no boundary.
+    TypeError
+        If there is no such option.
     """
+    _check_names(options)
     check_order(order)
     if boundary is None:
         raise ValueError(
@@ -67,6 +71,13 @@ def fit_points(
     else:
         begun = base_surface(boundary, cloud, net=net, order=order, method=base)
     return approximate(cloud, begun, method, **options)
+
+
+def _check_names(options: dict[str, Any]) -> None:
+    known = list(inspect.signature(approximate).parameters)[3:]  # behind points, base and method
+    for name in options:
+        if name not in known:
+            raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(known)}.")
 
 
 def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:

@@ -21,6 +21,10 @@ from jaxfit._checks import check_kind, check_number
 # outliers, but leave out all detail that a fit has not come to yet, and with it what would bring it there.
 SHARE, DEVIATIONS = 0.9, 1.6449
 
+# Of losses that let go of points: three times Tukey's 4.685, which is made for residuals that are normally
+# distributed. Those of a fit have long tails where detail is too fine for the net, and it would lose it all.
+WIDE = 14.0
+
 
 class AbstractLoss(eqx.Module):
     """How much a distance counts. `scale` is a fraction of the diagonal."""
@@ -99,7 +103,7 @@ class Tukey(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
+        c, as a fraction of the diagonal. By default 14 standard deviations, estimated anew in
         each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
@@ -113,7 +117,7 @@ class Tukey(AbstractLoss):
     """
 
     scale: float | None = None
-    width: ClassVar[float] = 4.685
+    width: ClassVar[float] = WIDE
 
     def cost(self, square: Array) -> Array:
         """(1 - (1 - x)^3) / 3 up to 1, then 1/3."""
@@ -130,9 +134,8 @@ class GemanMcClure(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 4.685 standard deviations, estimated anew in
-        each iteration from the distance that 90 % of the points do not exceed; with that width it pulls
-        as Tukey's does near 0.
+        c, as a fraction of the diagonal. By default 14 standard deviations, estimated anew in
+        each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
     ------
@@ -145,7 +148,7 @@ class GemanMcClure(AbstractLoss):
     """
 
     scale: float | None = None
-    width: ClassVar[float] = 4.685
+    width: ClassVar[float] = WIDE
 
     def cost(self, square: Array) -> Array:
         """x / (1 + x)."""
