@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from helpers import data, diagonal, eps, wavy_cloud
 from normal_reference import thin_plate_matrix
@@ -122,6 +123,29 @@ def objective(fit, surface, errors):
     net = np.asarray(surface.control_points).reshape(-1, 3)
     bending = SMOOTHING * np.einsum("ic,ij,jc", net, thin_plate_matrix(surface), net)
     return np.sum((np.asarray(errors) * float(fit.stats["diagonal"])) ** 2) + bending
+
+
+def test_optimistix_comes_to_the_same_minimum(base):
+    nearest = jf.closest_point(base, POINTS)
+    feet = (nearest.u, nearest.v)
+    method = jf.OrthogonalDistance(smoothing=SMOOTHING)
+    fit = jf.approximate(POINTS, base, method, tol_average=1e-9, max_steps=60)
+    values, vectors = np.linalg.eigh(np.asarray(thin_plate_matrix(base)))
+    root = jnp.asarray((vectors * np.sqrt(SMOOTHING * np.maximum(values, 0))).T)
+
+    def residual(inner, feet):
+        net = base.control_points.at[1:-1, 1:-1].set(inner)
+        surface = jf.BSplineSurface(net, base.knots_u, base.knots_v)
+        return POINTS - jf.closest_point(surface, POINTS, start=feet).point, root @ net.reshape(-1, 3)
+
+    def objective(inner):
+        return float(sum(jnp.sum(x**2) for x in residual(inner, feet)))
+
+    begun, mine = (x.control_points[1:-1, 1:-1] for x in (base, fit.surface))
+    solver = optx.LevenbergMarquardt(1e-6, 1e-8)
+    theirs = optx.least_squares(residual, solver, begun, feet, max_steps=30, throw=False).value
+    assert objective(theirs) < 1e-2 * objective(begun)
+    assert abs(objective(mine) / objective(theirs) - 1) < 0.02
 
 
 def test_the_objective_falls_below_that_of_standard_approximation(base, fit):

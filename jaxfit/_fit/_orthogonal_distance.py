@@ -97,7 +97,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
     2006. The correction is that of Transtrum and Sethna (arXiv:1201.5885). It runs in the loop of all fits
     rather than in an optimistix solver: the objective is known only when feet have been found, these are
-    taken back together with the net, and nets grow, for which the latter has no place.
+    taken back together with the net, and nets grow, for which the latter has no place. Given the residual
+    `points - closest_point(surface, points).point`, whose derivative is implicit, `optimistix.least_squares`
+    comes to the same minimum, with dense Jacobians or many passes over the points.
     """
 
     smoothing: Any = 5e-6
