@@ -171,6 +171,14 @@ def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
         raise TypeError(f"{name} must be an object such as {example}, but is {given}; pass {example}.")
 
 
+def check_switches(owner: Any, names: tuple[str, ...]) -> None:
+    """Fields that are True or False and nothing else."""
+    for name in names:
+        value = getattr(owner, name)
+        if not isinstance(value, (bool, np.bool_)):
+            raise TypeError(f"{name} must be True or False, but is {value!r}; pass either.")
+
+
 def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:
     """Raise unless a concrete `value` is a number, at least `least`, and whole (and no larger than numbers
     of 32 bits) if so asked."""

@@ -36,6 +36,17 @@ def test_a_closed_polyline_is_split_at_its_far_side():
     np.testing.assert_array_equal(simplify(ring, 0.1, most=3), [0, 20, 40])
 
 
+@pytest.mark.parametrize("shift", [1.0, 0.1, 5e6])
+def test_which_of_equal_pieces_goes_first_does_not_depend_on_rounding(shift):
+    t = np.linspace(0, 1, 25)
+    lines = [np.stack([t, 0 * t], axis=1), np.stack([t, np.abs(np.sin(4 * np.pi * t))], axis=1)]
+    for line in lines:
+        for most in range(3, 20):
+            first, moved = (simplify(x, 1e-3, least=most, most=most) for x in (line, line + shift))
+            np.testing.assert_array_equal(first, moved)
+        np.testing.assert_allclose(densify(line + shift, 40), densify(line, 40) + shift, atol=1e-8)
+
+
 @pytest.mark.parametrize("count", [2, 5, 17, 64])
 def test_exactly_as_many_vertices_as_asked(count):
     points = np.cumsum(np.random.default_rng(0).normal(size=(64, 3)), axis=0)

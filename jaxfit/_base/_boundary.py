@@ -121,8 +121,9 @@ def _check_lengths(lines: dict[str, np.ndarray], rounding: float) -> None:
     for name, line in lines.items():
         if diagonal(line) <= rounding:
             raise ValueError(
-                f"{name} has length zero; patches with three sides are not supported, so cut "
-                "the tip off or give a polyline of distinct points."
+                f"{name} has length zero in {line.dtype}; patches with three sides are not supported, so cut "
+                "the tip off or give a polyline of distinct points, and subtract what is common to large "
+                "coordinates or switch on jax_enable_x64."
             )
 
 

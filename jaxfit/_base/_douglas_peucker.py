@@ -4,6 +4,9 @@ import heapq
 
 import numpy as np
 
+TIE = 1e-7  # of the whole length: smaller differences are rounding, and the first of several counts
+FLAT_TOP = 1e-3  # at most, of the farthest distance: in a slight bend several are almost that far away
+
 
 def chord_lengths(points: np.ndarray) -> np.ndarray:
     """Length of the polyline (n, d) up to each vertex, (n,), starting with 0."""
@@ -16,7 +19,8 @@ def densify(points: np.ndarray, count: int) -> np.ndarray:
     edges = np.linalg.norm(np.diff(points, axis=0), axis=1)
     parts = np.ones(len(edges), int)
     for _ in range(count - len(points)):
-        parts[np.argmax(edges / parts)] += 1
+        lengths = edges / parts
+        parts[np.argmax(lengths >= (1 - TIE) * lengths.max())] += 1
     edge = np.repeat(np.arange(len(edges)), parts)
     part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
     t = (part / parts[edge])[:, None]
@@ -48,14 +52,15 @@ def simplify(
     """
     arc = chord_lengths(points)
     kept = [0, len(points) - 1]
-    heap: list[tuple[float, float, int, int, int, bool]] = []
+    grain = TIE * float(arc[-1]) or 1.0
+    heap: list[tuple[int, int, int, int, int, bool]] = []
 
     def offer(i: int, j: int) -> None:
         if j - i > 1:
             length = float(arc[j] - arc[i])
-            k, distance = _split(points, arc, i, j, tolerance)
-            priority = -distance - spread * length
-            heapq.heappush(heap, (priority, -length, i, j, k, distance == 0.0))
+            k, distance = _split(points, arc, i, j, tolerance, grain)
+            first, then = (round(-x / grain) for x in (distance + spread * length, length))
+            heapq.heappush(heap, (first, then, i, j, k, distance == 0.0))
 
     offer(*kept)
     while heap and (most is None or len(kept) < most):
@@ -68,15 +73,17 @@ def simplify(
     return np.sort(kept)
 
 
-def _split(points: np.ndarray, arc: np.ndarray, i: int, j: int, tolerance: float) -> tuple[int, float]:
+def _split(
+    points: np.ndarray, arc: np.ndarray, i: int, j: int, tolerance: float, grain: float
+) -> tuple[int, float]:
     """Where to split the piece i..j, and its farthest distance, 0 if within the tolerance."""
     start, chord = points[i], points[j] - points[i]
     inner = points[i + 1 : j] - start
     square = float(chord @ chord)
     along = np.clip(inner @ chord / square, 0.0, 1.0) if square > 0 else np.zeros(len(inner))
-    squares = np.sum((inner - along[:, None] * chord) ** 2, axis=1)
-    farthest = int(np.argmax(squares))
-    distance = float(np.sqrt(squares[farthest]))
+    distances = np.linalg.norm(inner - along[:, None] * chord, axis=1)
+    distance = float(distances.max())
     if distance > tolerance:
-        return i + 1 + farthest, distance
-    return i + 1 + int(np.argmin(np.abs(arc[i + 1 : j] - (arc[i] + arc[j]) / 2))), 0.0
+        return i + 1 + int(np.argmax(distances >= distance - min(grain, FLAT_TOP * distance))), distance
+    off = np.abs(arc[i + 1 : j] - (arc[i] + arc[j]) / 2)
+    return i + 1 + int(np.argmax(off <= off.min() + grain)), 0.0

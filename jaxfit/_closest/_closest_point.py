@@ -113,8 +113,10 @@ def closest_point(
     quadratic convergence, a tangential residual below a hundredth of the tolerance, which saves one.
 
     The global search can miss the nearest foot where samples are very uneven: next to an edge collapsed to a
-    point, a few queries in ten thousand. On a surface with a jump (a knot as often as its order) the value
-    at the knot is that from the right; a query nearest to the left one is reported as not converged.
+    point, a few queries in ten thousand. Nor does it tell two feet apart that lie within one and a half of
+    its samples (a third of a span each, or less), as on a surface that folds over so tightly. On a surface
+    with a jump (a knot as often as its order) the value at the knot is that from the right; a query nearest
+    to the left one is reported as not converged.
 
     Works under `jit`, `vmap` and `grad`. Inside a transformation the global search is by brute force from
     two starts per point, which is slower and may, where three or more feet compete, miss the nearest. The

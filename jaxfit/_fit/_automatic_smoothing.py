@@ -50,8 +50,10 @@ class GeneralizedCrossValidation(AbstractSmoothing):
 
     That is the least $|Q - A P|^2 / (N - \operatorname{tr} H)^2$ over N points.
 
-    Needs nothing to be known of the noise, but that it is independent from point to point. Golub, Heath and
-    Wahba, Technometrics 21 (1979).
+    Needs nothing to be known of the noise, but that it is independent from point to point, and parameters
+    that do not follow it. Those on a base made with the points (`Meshless`) do where the noise is as large as
+    the distances between points; lambda is then chosen too small, by orders of magnitude, and
+    `Discrepancy` is the better choice. Golub, Heath and Wahba, Technometrics 21 (1979).
 
     Parameters
     ----------

@@ -35,7 +35,7 @@ def fit_points(
         The four sides of the patch.
     net : (nu, nv), optional
         Control points along u and v. Default: about one for every eight points, shared between the
-        directions by the lengths of the sides, at most 64 each.
+        directions by the lengths of the sides, at least twice the order and at most 64 each.
     order : (K, L)
         Degree + 1 along u and v.
     base : Coons(), Meshless() or DynamicBaseSurface(), optional

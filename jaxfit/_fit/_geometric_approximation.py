@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxfit._checks import check_kind
+from jaxfit._checks import check_kind, check_number, check_switches
 from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._fairing import Fairing
 from jaxfit._fit._foot_moves import Follow, Stay
@@ -131,9 +131,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
             if getattr(self, name) is not None:
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
-        for name in ("fixed_boundary", "foresee", "local"):
-            if not isinstance(getattr(self, name), bool):
-                raise TypeError(f"{name} must be True or False, but is {getattr(self, name)!r}; pass either.")
+        check_switches(self, ("fixed_boundary", "foresee", "local"))
+        check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
         if not 0 < self.relaxation < most:
             raise ValueError(

@@ -261,7 +261,10 @@ def result_of(code: Any) -> Any:
 def advance(
     method: AbstractIterativeMethod, problem: Any, limits: Limits, until: Array, carry: Carry
 ) -> Carry:
-    """Iterate up to step `until`, or to the end. A fit that stalls or diverges gives back its best net."""
+    """Iterate up to step `until`, or to the end.
+
+    A fit that stalls or diverges gives back its best net, if the method keeps that.
+    """
     running = code_of(RESULTS.running)
 
     def body(carry: Carry) -> Carry:

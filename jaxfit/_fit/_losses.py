@@ -21,10 +21,6 @@ from jaxfit._checks import check_kind, check_number
 # outliers, but leave out all detail that a fit has not come to yet, and with it what would bring it there.
 SHARE, DEVIATIONS = 0.9, 1.6449
 
-# Of losses that let go of points: three times Tukey's 4.685, which is made for residuals that are normally
-# distributed. Those of a fit have long tails where detail is too fine for the net, and it would lose it all.
-WIDE = 14.0
-
 
 class AbstractLoss(eqx.Module):
     """How much a distance counts. `scale` is a fraction of the diagonal."""
@@ -94,6 +90,11 @@ class Huber(AbstractLoss):
         return 1.0 / jnp.sqrt(jnp.maximum(square, 1.0))
 
 
+# The usual 4.685 is made for residuals that are normally distributed. Those of a fit have long tails where
+# detail is too fine for the net, and it would lose all of that.
+TUKEY, GEMAN_MCCLURE = 14.0, 7.0
+
+
 class Tukey(AbstractLoss):
     r"""Tukey's biweight: points farther than the scale c do not pull at all.
 
@@ -117,7 +118,7 @@ class Tukey(AbstractLoss):
     """
 
     scale: float | None = None
-    width: ClassVar[float] = WIDE
+    width: ClassVar[float] = TUKEY
 
     def cost(self, square: Array) -> Array:
         """(1 - (1 - x)^3) / 3 up to 1, then 1/3."""
@@ -134,7 +135,7 @@ class GemanMcClure(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 14 standard deviations, estimated anew in
+        c, as a fraction of the diagonal. By default 7 standard deviations, estimated anew in
         each iteration from the distance that 90 % of the points do not exceed.
 
     Raises
@@ -148,7 +149,7 @@ class GemanMcClure(AbstractLoss):
     """
 
     scale: float | None = None
-    width: ClassVar[float] = WIDE
+    width: ClassVar[float] = GEMAN_MCCLURE
 
     def cost(self, square: Array) -> Array:
         """x / (1 + x)."""

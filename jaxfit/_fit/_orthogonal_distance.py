@@ -10,7 +10,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._cells import staged
-from jaxfit._checks import check_number
+from jaxfit._checks import check_number, check_switches
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._growth import Growth, KnotInsertion, check_insertion
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
@@ -120,6 +120,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
+        check_switches(self, ("fixed_boundary",))
+        check_number("damping", self.damping, 0.0)
         if not 0 < self.damping <= 1:
             raise ValueError(
                 f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."

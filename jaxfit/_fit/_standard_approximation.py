@@ -9,7 +9,7 @@ from jax import Array
 from jaxtyping import Bool
 
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind
+from jaxfit._checks import check_kind, check_switches
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._automatic_smoothing import AbstractSmoothing, chosen
 from jaxfit._fit._growth import KnotInsertion, check_insertion
@@ -92,6 +92,7 @@ class StandardApproximation(AbstractIterativeMethod):
             check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
+        check_switches(self, ("fixed_boundary", "parameter_correction"))
 
     def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
         """With lambda moved into the problem, so that another one compiles nothing; 0 until it is chosen."""
