@@ -21,6 +21,7 @@ from jaxfit._cells._polynomials import horner as horner
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows
 from jaxfit._cells._rows import make_single_rows as make_single_rows
+from jaxfit._cells._rows import narrow_width as narrow_width
 from jaxfit._cells._rows import row_width as row_width
 from jaxfit._cells._stage import staged as staged
 from jaxfit._cells._sums import cells_to_net as cells_to_net

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells._few import FEW, few_of, rows_of_few
 from jaxfit._cells._layout import rows_of
-from jaxfit._cells._rows import Rows, row_count, row_width
+from jaxfit._cells._rows import Rows, narrow_width, row_count
 from jaxfit._splines._pieces import Pieces
 
 ROOM = 8  # one row of its own for so many others, at most
@@ -33,7 +33,7 @@ class KeptRows(eqx.Module):
     @staticmethod
     def none(points: int, cells: int) -> "KeptRows":
         """Nothing to begin with."""
-        width = row_width(points, cells)
+        width = narrow_width(points, cells)
         count, zero = row_count(points, cells, width), np.zeros((), np.int32)
         rows = Rows(np.zeros(count, np.int32), np.full((count, width), points, np.int32), zero, points)
         return KeptRows(rows, zero - 1, np.zeros(2, np.int32))

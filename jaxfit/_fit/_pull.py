@@ -22,9 +22,9 @@ from jaxfit._cells import (
     few_of,
     in_line,
     in_rows,
+    narrow_width,
     over_blocks,
     row_moments,
-    row_width,
     rows_of,
     rows_of_few,
     staged,
@@ -80,7 +80,7 @@ def pull(
     )
     one = partial(_one_pass, problem, pieces, weigh, move, move.prepare(problem, pieces))
     if rows is None:
-        rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), idle)
+        rows = rows_of(pieces, u, v, narrow_width(u.shape[0], pieces.cells), idle)
     if move.looks == 1:
         done = one(rows, SLOTS_PER_BLOCK, 1, begin)
     else:
