@@ -174,9 +174,13 @@ def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
 def check_switches(owner: Any, names: tuple[str, ...]) -> None:
     """Fields that are True or False and nothing else."""
     for name in names:
-        value = getattr(owner, name)
-        if not isinstance(value, (bool, np.bool_)):
-            raise TypeError(f"{name} must be True or False, but is {value!r}; pass either.")
+        check_switch(name, getattr(owner, name))
+
+
+def check_switch(name: str, value: Any) -> None:
+    """Raise unless `value` is True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False, but is {value!r}; pass either.")
 
 
 def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:

@@ -52,8 +52,8 @@ def row_width(points: int, cells: int) -> int:
 
 
 def narrow_width(points: int, cells: int) -> int:
-    """Three quarters of that, for passes that move feet as well, where an empty slot costs as much as a full
-    one, and which were faster so for few and for many points in a cell.
+    """Three quarters of `row_width`: for passes that move feet as well, in which empty slots cost as much as
+    full ones.
     """
     return 3 * row_width(points, cells) // 4
 

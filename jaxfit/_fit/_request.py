@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxfit._checks import as_floating, check_kind, check_number, check_steps, is_concrete
+from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
 from jaxfit._fit._geometric_approximation import GeometricApproximation
 from jaxfit._fit._orthogonal_distance import OrthogonalDistance
 from jaxfit._fit._problem import Unit, unit_of
@@ -34,8 +34,7 @@ def checked_request(
 
     The `domain` is that of the base surface, once there is one.
     """
-    if not isinstance(throw, (bool, np.bool_)):
-        raise TypeError(f"throw must be True or False, but is {throw!r}; pass either.")
+    check_switch("throw", throw)
     if method is not None:
         check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
     check_steps("max_steps", max_steps)
