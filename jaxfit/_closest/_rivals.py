@@ -41,30 +41,31 @@ class Search:
 
     def _query(self, which: Any, count: int, workers: int = -1) -> tuple[np.ndarray, np.ndarray]:
         count = min(count, self.tree.n)
-        distance, index = self.tree.query(self.points[which], k=count, workers=workers)
-        return distance.reshape(-1, count), index.reshape(-1, count)
+        found = self.tree.query(self.points[which], k=count, workers=workers)
+        distance, index = (np.ascontiguousarray(x.reshape(-1, count).T) for x in found)
+        return distance, index
 
     def nearest(self) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of the nearest sample of every point."""
-        return self.parameters(self.index[:, 0])
+        return self.parameters(self.index[0])
 
     def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of samples given by number."""
         row, column = np.divmod(index, self.along_v.u.size)
         return self.along_u.u[row], self.along_v.u[column]
 
-    def elsewhere(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Which samples, a row of them for each foot (u, v), do not lie beside it."""
+    def elsewhere(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Which samples, each for the foot (u, v) with the number `which`, do not lie beside it."""
         row, column = np.divmod(sample, self.along_v.u.size)
-        apart = self.along_u.apart(row, u) | self.along_v.apart(column, v)
+        apart = self.along_u.apart(row, u, which) | self.along_v.apart(column, v, which)
         # Round a corner, on the other border, there may be another foot, however close.
         edge_u, edge_v = self.along_u.is_end(u), self.along_v.is_end(v)
-        for here, there, direction, number in (
-            (edge_u, edge_v, self.along_v, column),
-            (edge_v, edge_u, self.along_u, row),
+        for border, direction, number in (
+            (edge_u & ~edge_v, self.along_v, column),
+            (edge_v & ~edge_u, self.along_u, row),
         ):
-            border = np.flatnonzero(here & ~there)
-            apart[border] |= direction.is_last(number[border])
+            if border.any():
+                apart |= border[which] & direction.is_last(number)
         return apart
 
     def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
@@ -80,19 +81,20 @@ class Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of some points: so few that everything stays in the caches."""
         which = np.arange(len(distance))[part]
-        near, index = self.distance[part], self.index[part]
+        near, index = self.distance[:, part], self.index[:, part]
         who, sample = [], []
         steps: tuple[Any, ...] = (*NEIGHBOURS[1:], None)
         for more in steps:
+            reach, slack, sag = distance[which], self.slack[index], self.sag[index]
+            open_ = near**2 <= reach**2 + slack + reach * sag
             crowded = np.zeros(len(which), bool)
-            if near.shape[1] < self.tree.n and more is not None:
-                crowded = self._is_crowded(near[:, -1], index, distance[which])
-            reach = distance[which][:, None]
-            open_ = near**2 <= reach**2 + self.slack[index] + reach * self.sag[index]
-            row, column = np.nonzero(open_ & ~crowded[:, None])
-            there, mine = index[row, column], which[row]
-            apart = self.elsewhere(there, u[mine], v[mine])
-            who.append(mine[apart])
+            if near.shape[0] < self.tree.n and more is not None:
+                crowded = self._is_crowded(near[-1], reach, slack, sag)
+                open_ &= ~crowded
+            row, column = np.nonzero(open_)
+            there = index[row, column]
+            apart = self.elsewhere(there, u[which], v[which], column)
+            who.append(which[column[apart]])
             sample.append(there[apart])
             which = which[crowded]
             if not which.size:
@@ -100,10 +102,12 @@ class Search:
             near, index = self._query(which, more, workers=1)
         return np.concatenate(who), np.concatenate(sample)
 
-    def _is_crowded(self, last: np.ndarray, index: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    def _is_crowded(
+        self, last: np.ndarray, reach: np.ndarray, slack: np.ndarray, sag: np.ndarray
+    ) -> np.ndarray:
         """Where samples farther than the last may matter, having at most WIDER times the slack of these."""
-        wide, sag = (np.minimum(x.max(), WIDER * x[index.T].max(axis=0)) for x in (self.slack, self.sag))
-        return last**2 <= reach**2 + wide + reach * sag
+        wide = np.minimum(self.slack.max(), WIDER * slack.max(axis=0))
+        return last**2 <= reach**2 + wide + reach * np.minimum(self.sag.max(), WIDER * sag.max(axis=0))
 
     def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
         """Whether none of the eight samples around `sample` is nearer to the point `who`.
@@ -138,18 +142,15 @@ class _Direction:
         """Whether samples lie at either end of a direction that has two."""
         return ((number == 0) | (number == self.u.size - 1)) & (self.u.size > 1)
 
-    def apart(self, number: np.ndarray, foot: np.ndarray) -> np.ndarray:
-        """Whether samples are more than BESIDE away from a foot, or in another stretch.
+    def apart(self, number: np.ndarray, foot: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Whether samples are more than BESIDE away from the foot number `which`, or in another stretch.
 
         Across a crease there may be another foot, however close.
         """
         at = np.interp(foot, self.u, np.arange(self.u.size))
-        shape = (-1,) + (1,) * (number.ndim - 1)
-        # Whole numbers from low to high lie beside the foot.
-        low, high = np.ceil(at - BESIDE).astype(int), np.floor(at + BESIDE).astype(int)
-        apart = (number < low.reshape(shape)) | (number > high.reshape(shape))
+        apart = np.abs(number - at[which]) > BESIDE
         if not self.smooth:
-            apart |= self.stretch[number] != self.stretch[at.astype(int)].reshape(shape)
+            apart |= self.stretch[number] != self.stretch[at.astype(int)][which]
         return apart
 
 
@@ -172,7 +173,7 @@ class Rivals:
 
     def found(self, u: np.ndarray, v: np.ndarray) -> None:
         """Drop the samples beside the feet at (u, v), which are given for all points."""
-        self._keep(self.search.elsewhere(self.sample, u[self.who], v[self.who]))
+        self._keep(self.search.elsewhere(self.sample, u, v, self.who))
 
     def first(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One start for each point that has any, taken off the list."""

@@ -4,7 +4,7 @@ The surface is sampled a few times per cell, on the knots too.
 """
 
 import math
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -19,7 +19,7 @@ from jaxfit._splines._pieces import Axis, Numbers, Pieces
 LEAST_SAMPLES = 24  # per direction, for surfaces of few cells
 CURVE_SAMPLES = 24  # per span of a curve
 MOST_SAMPLES = 400_000  # in all, for nets of very many cells
-SLACK = 2.0  # for steps along u and v that are not at right angles
+SLACK = 2.0  # for neighbours that are not at twice the distance of what lies half way
 SAG = 1.5  # for second derivatives that change between samples
 BLOCK = 2048
 
@@ -30,7 +30,7 @@ class Samples(NamedTuple):
     u: Float[Numbers, " a"]
     v: Float[Numbers, " b"]
     points: Float[Numbers, "a b d"]
-    slack: Float[Numbers, "a b"]  # SLACK times the squared half spacing around each sample
+    slack: Float[Numbers, "a b"]  # SLACK times the squared half distance to the farthest neighbour
     stretch_u: Int[Numbers, " a"]  # which smooth stretch between creases a sample belongs to
     stretch_v: Int[Numbers, " b"]
     sag: Float[Numbers, "a b"]  # SAG times the second-order normal part of a step, doubled
@@ -58,7 +58,9 @@ def sample(pieces: Pieces) -> Samples:
     cell_u, cell_v = axis_u.locate(u), axis_v.locate(v)
     jet = _grid_jet(pieces, u, v, cell_u, cell_v)
     points = jet[0, 0]
-    slack = 0.25 * SLACK * (_gap2(points, 0) + _gap2(points, 1))
+    xp: Any = np if is_concrete(points) else jnp
+    neighbours = (_gap2(points, i, j) for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)))
+    slack = 0.25 * SLACK * reduce(xp.maximum, neighbours)
     sag = SAG * _sag(jet, 1.0 / count_u, 1.0 / count_v)
     return Samples(u, v, points, slack, axis_u.first[cell_u], axis_v.first[cell_v], sag)
 
@@ -67,17 +69,20 @@ def _grid_jet(pieces: Pieces, u: Any, v: Any, cell_u: Any, cell_v: Any) -> Float
     """Derivatives in local coordinates up to order (2, 2) on a grid of parameters, direction by direction."""
     axis_u, axis_v = pieces.axis_u, pieces.axis_v
     concrete = is_concrete(pieces)
-    einsum: Any = np.einsum if concrete else partial(jnp.einsum, precision="highest")
-    order_u, order_v = pieces.order
+    matmul: Any = np.matmul if concrete else partial(jnp.matmul, precision="highest")
+    (order_u, order_v), d = pieces.order, pieces.coefficients.shape[1]
     s = (u - axis_u.centre[cell_u]) / axis_u.half[cell_u]
     t = (v - axis_v.centre[cell_v]) / axis_v.half[cell_v]
     coefficients = np.asarray(pieces.coefficients) if concrete else pieces.coefficients
-    cells = coefficients.reshape(axis_u.cells, axis_v.cells, -1, order_u, order_v)
-    rows = einsum("iak,avdkl->iavdl", _monomials(s, order_u), cells[cell_u])
-    return einsum("jbl,iabdl->ijabd", _monomials(t, order_v), rows[:, :, cell_v])
+    cells = coefficients.reshape(axis_u.cells, axis_v.cells, d, order_u, order_v).transpose(0, 3, 1, 4, 2)
+    # A small matrix for each sample of one direction, all of the other side by side.
+    rows = matmul(_monomials(s, order_u), cells.reshape(axis_u.cells, order_u, -1)[cell_u])
+    rows = rows.reshape(-1, 3, axis_v.cells, order_v, d).transpose(2, 3, 1, 0, 4)
+    both = matmul(_monomials(t, order_v), rows.reshape(axis_v.cells, order_v, -1)[cell_v])
+    return both.reshape(-1, 3, 3, u.shape[0], d).transpose(2, 1, 3, 0, 4)
 
 
-def _monomials(x: Any, order: int) -> Float[Numbers, "3 a K"]:
+def _monomials(x: Any, order: int) -> Float[Numbers, "a 3 K"]:
     """1, x, x^2, ... and their first and second derivatives."""
     xp: Any = np if is_concrete(x) else jnp
     power = np.arange(order)
@@ -85,7 +90,7 @@ def _monomials(x: Any, order: int) -> Float[Numbers, "3 a K"]:
     for i in range(3):
         factor = np.array([math.perm(k, i) for k in range(order)], x.dtype)
         rows.append(factor[None, :] * x[:, None] ** np.maximum(power - i, 0)[None, :])
-    return xp.stack(rows)
+    return xp.stack(rows, axis=1)
 
 
 def _along(axis: Axis, count: int) -> Float[Numbers, " a"]:
@@ -105,28 +110,34 @@ def _sag(jet: Float[Numbers, "3 3 a b d"], a: float, b: float) -> Float[Numbers,
     t = _without(jet[0, 1], s)
     xp: Any = np if is_concrete(jet) else jnp
     seconds = (_without(_without(x, s), t) for x in (jet[2, 0], jet[1, 1], jet[0, 2]))
-    ss, st, tt = (xp.sqrt(xp.sum(x * x, axis=-1)) for x in seconds)
+    ss, st, tt = (xp.sqrt(_dot(x, x)) for x in seconds)
     return ss * a**2 + 2.0 * st * a * b + tt * b**2
 
 
 def _without(x: Float[Numbers, "a b d"], along: Float[Numbers, "a b d"]) -> Float[Numbers, "a b d"]:
     """The part of x at right angles to `along`, or x where that vanishes."""
     xp: Any = np if is_concrete(x, along) else jnp
-    square = xp.sum(along * along, axis=-1, keepdims=True)
+    square = _dot(along, along)
     some = square > jnp.finfo(x.dtype).tiny
-    share = xp.sum(x * along, axis=-1, keepdims=True) / xp.where(some, square, 1.0)
-    return x - xp.where(some, share, 0.0) * along
+    share = _dot(x, along) / xp.where(some, square, 1.0)
+    return x - xp.where(some, share, 0.0)[..., None] * along
 
 
-def _gap2(points: Float[Numbers, "a b d"], axis: int) -> Float[Numbers, "a b"]:
-    """Squared distance to the farther neighbour along an axis."""
+def _dot(x: Float[Numbers, "a b d"], y: Float[Numbers, "a b d"]) -> Float[Numbers, "a b"]:
+    einsum: Any = np.einsum if is_concrete(x, y) else partial(jnp.einsum, precision="highest")
+    return einsum("abd,abd->ab", x, y)
+
+
+def _gap2(points: Float[Numbers, "a b d"], i: int, j: int) -> Float[Numbers, "a b"]:
+    """Squared distance to the farther of the neighbours (i, j) and (-i, -j) of a sample, if there are any."""
     xp: Any = np if is_concrete(points) else jnp
-    if points.shape[axis] == 1:
-        return xp.zeros(points.shape[:2], points.dtype)
-    gaps = xp.sum(xp.diff(points, axis=axis) ** 2, axis=-1)
-    before = xp.pad(gaps, [(1, 0) if i == axis else (0, 0) for i in range(2)])
-    after = xp.pad(gaps, [(0, 1) if i == axis else (0, 0) for i in range(2)])
-    return xp.maximum(before, after)
+    (a, b), (right, left) = points.shape[:2], (max(j, 0), max(-j, 0))
+    if i >= a or abs(j) >= b:
+        return xp.zeros((a, b), points.dtype)
+    step = points[i:, right : b - left] - points[: a - i, left : b - right]
+    gaps = _dot(step, step)
+    before = xp.pad(gaps, ((i, 0), (right, left)))
+    return xp.maximum(before, xp.pad(gaps, ((0, i), (left, right))))
 
 
 def best_samples(
