@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxfit._cells import FEW, few_of, make_rows, row_width
+from jaxfit._cells import few_among, few_of, make_rows, row_width
 
 POINTS, CELLS = 60, 9
 compiled = jax.jit(make_rows, static_argnums=(1, 2))
@@ -99,8 +99,9 @@ def test_rows_get_wider_with_more_points_in_a_cell():
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.2, 1.0])
 def test_few_points_are_the_first_of_those_marked(points, share):
     mask = np.random.default_rng(points).uniform(size=points) < share
-    number = np.asarray(jax.jit(few_of)(jnp.asarray(mask)))
-    first = np.flatnonzero(mask)[:FEW]
-    assert number.shape == (min(FEW, points),)
+    few = few_among(points)
+    number = np.asarray(jax.jit(few_of, static_argnums=1)(jnp.asarray(mask), few))
+    first = np.flatnonzero(mask)[:few]
+    assert number.shape == (few,)
     np.testing.assert_array_equal(number[: len(first)], first)
     assert (number[len(first) :] == points).all()

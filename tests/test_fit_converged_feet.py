@@ -7,7 +7,7 @@ import pytest
 from helpers import eps, random_surface, wavy_cloud, wavy_surface
 
 import jaxfit as jf
-from jaxfit._cells import KeptRows
+from jaxfit._cells import KeptRows, cells_of
 from jaxfit._fit._foot_moves import Arrive
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._pull import _above_rounding, pull
@@ -83,9 +83,14 @@ def test_what_counts_as_certain_is_a_foot(surface, off):
         )
         return pull(problem, pieces, u, v, 0 * u, u < 0, lambda weight, error: weight, Arrive())
 
-    feet, looks, _, active = gather(jnp.asarray(1.0, dtype), *start)
+    feet, looks, gone, _, active = gather(jnp.asarray(1.0, dtype), *start)
     certain = np.asarray(looks) > 0
     assert certain.sum() == active
+    # Who is found in another cell than it started from has left that, and no one found at first sight has.
+    ends = np.asarray(feet[:2])
+    moved = cells_of(pieces, *(np.asarray(x) for x in start)) != cells_of(pieces, *ends)
+    assert np.asarray(gone)[certain & moved & ~on_a_knot(pieces, *ends)].all()
+    assert not np.asarray(gone)[np.asarray(looks) == 1].any()
     assert certain.mean() > (0.9 if off < 1e-2 else 0.2)
     u, v = np.asarray(feet[:2])[:, certain]
     e = target[certain] - np.asarray(surface(u, v))
@@ -94,6 +99,14 @@ def test_what_counts_as_certain_is_a_foot(surface, off):
         tangent = np.asarray(surface.derivative(u, v, du, dv))
         across = np.sum(e * tangent, axis=1) / np.linalg.norm(tangent, axis=1)
         assert np.abs(across[(x > 0) & (x < 1)]).max() <= 1.01 * tolerance + 50 * eps()
+
+
+def on_a_knot(pieces, u, v):
+    axes = (pieces.axis_u, pieces.axis_v)
+    off = [
+        np.abs(x[:, None] - np.asarray(axis.breaks)).min(axis=1) for axis, x in zip(axes, (u, v), strict=True)
+    ]
+    return np.minimum(*off) < 1e-5
 
 
 def assert_kept(kept, pieces, u, v, left_out):

@@ -14,6 +14,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 ROOMS = [
     ("_checks",),
     ("_precision",),
+    ("_stage",),
     ("_splines",),
     ("_parameters",),
     ("_cells",),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfit._cells import evaluate_jet, evaluate_values
+from jaxfit._cells import evaluate_jet, evaluate_values, jet_along_rows, values_along_rows
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._pieces import as_surface_arrays, make_axis, make_pieces
 
@@ -89,3 +89,34 @@ def test_stretches_end_at_creases_only():
     axis = make_axis(knots, 3)
     stretch = np.stack([axis.low, axis.high], axis=1)[axis.locate(jnp.asarray([0.1, 0.3, 0.5, 1]))]
     np.testing.assert_array_equal(stretch, [[0, 0.5], [0, 0.5], [0.5, 1], [0.5, 1]])
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("cells", [1, 2, 29, 30, 61, 200, 1000])
+def test_the_cell_of_a_parameter_is_that_of_a_sorted_search(cells):
+    rng = np.random.default_rng(cells)
+    inner = np.sort(rng.choice(rng.uniform(0, 1, cells), cells - 1))  # some repeat
+    knots = np.concatenate([np.zeros(4), inner, np.ones(4)]).astype(jnp.result_type(float))
+    axis = make_axis(knots, 4)
+    u = np.concatenate([rng.uniform(0, 1, 500), knots, np.nextafter(knots[:-4], 2)]).astype(knots.dtype)
+    expected = np.clip(np.searchsorted(axis.breaks, u, side="right") - 1, *axis.ends)
+    np.testing.assert_array_equal(jax.jit(lambda u: axis.locate(u))(u), expected)
+    np.testing.assert_array_equal(axis.locate(u), expected)
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("order", [(1, 2), (2, 5), (4, 4)])
+def test_a_row_of_points_shares_its_polynomial(order):
+    rng = np.random.default_rng(8)
+    coefficients = jnp.asarray(rng.normal(size=(7, 3, *order)))
+    s, t = (jnp.asarray(rng.uniform(-1, 1, (7, 5))) for _ in range(2))
+    several = jnp.moveaxis(coefficients, 0, -1)[..., None]
+    for here, there in zip(jet_along_rows(coefficients, s, t), evaluate_jet(several, s, t), strict=True):
+        assert here.shape == (3, 7, 5)
+        np.testing.assert_allclose(here, there, rtol=0, atol=100 * helpers.eps())
+    np.testing.assert_allclose(
+        values_along_rows(coefficients, s, t),
+        evaluate_values(several, s, t),
+        rtol=0,
+        atol=100 * helpers.eps(),
+    )

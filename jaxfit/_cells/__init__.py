@@ -2,7 +2,7 @@
 
 from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
 from jaxfit._cells._blocks import over_blocks as over_blocks
-from jaxfit._cells._few import FEW as FEW
+from jaxfit._cells._few import few_among as few_among
 from jaxfit._cells._few import few_of as few_of
 from jaxfit._cells._few import rows_of_few as rows_of_few
 from jaxfit._cells._kept_rows import KeptRows as KeptRows
@@ -18,12 +18,13 @@ from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
 from jaxfit._cells._polynomials import horner as horner
+from jaxfit._cells._polynomials import jet_along_rows as jet_along_rows
+from jaxfit._cells._polynomials import values_along_rows as values_along_rows
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows
 from jaxfit._cells._rows import make_single_rows as make_single_rows
 from jaxfit._cells._rows import narrow_width as narrow_width
 from jaxfit._cells._rows import row_width as row_width
-from jaxfit._cells._stage import staged as staged
 from jaxfit._cells._sums import cells_to_net as cells_to_net
 from jaxfit._cells._sums import net_sums as net_sums
 from jaxfit._cells._sums import row_moments as row_moments

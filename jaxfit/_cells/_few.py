@@ -8,14 +8,20 @@ from jaxfit._cells._layout import cells_of
 from jaxfit._cells._rows import Rows
 from jaxfit._splines._pieces import Pieces
 
-FEW = 512  # points that are looked up one by one
-
+# Points that are looked up one by one: one of so many, within bounds.
+ONE_OF = 128
+LEAST_FEW, MOST_FEW = 64, 1024
 BITS = 32  # of a word of flags
 HALVES = (16, 8, 4, 2, 1)
 
 
-def few_of(mask: Bool[Array, " points"]) -> Int[Array, " few"]:
-    """The numbers of the first `FEW` points with `mask`, ascending, and then the number of points.
+def few_among(points: int) -> int:
+    """How many out of so many points count as few."""
+    return min(points, max(LEAST_FEW, min(MOST_FEW, points // ONE_OF)))
+
+
+def few_of(mask: Bool[Array, " points"], few: int) -> Int[Array, " few"]:
+    """The numbers of the first `few` points with `mask`, ascending; after the last the number of points.
 
     Flags are packed into words, and the k-th one that is set is found by counting bits: first over words,
     then over halves of halves of one. Several times as quick as `jnp.nonzero`, which adds up flag by flag.
@@ -26,7 +32,7 @@ def few_of(mask: Bool[Array, " points"]) -> Int[Array, " few"]:
     word = jnp.sum(flags << jnp.arange(BITS, dtype=jnp.uint32)[None], axis=1, dtype=jnp.uint32)
     ones = _ones(word)
     until = jnp.cumsum(ones, dtype=jnp.int32)
-    rank = jnp.arange(min(FEW, points), dtype=jnp.int32)
+    rank = jnp.arange(min(few, points), dtype=jnp.int32)
     home = jnp.searchsorted(until, rank, side="right", method="scan_unrolled").astype(jnp.int32)
     at = jnp.minimum(home, words - 1)
     rest, rank, place = word[at], rank - (until[at] - ones[at]), jnp.zeros_like(rank)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells._few import FEW, few_of, rows_of_few
+from jaxfit._cells._few import few_among, few_of, rows_of_few
 from jaxfit._cells._layout import rows_of
 from jaxfit._cells._rows import Rows, narrow_width, row_count
 from jaxfit._splines._pieces import Pieces
@@ -51,7 +51,7 @@ class KeptRows(eqx.Module):
         moved = moved & ~left_out
         count = jnp.sum(moved, dtype=jnp.int32)
         net = jnp.stack([jnp.asarray(a.used, jnp.int32) for a in (pieces.axis_u, pieces.axis_v)])
-        stale = (count > FEW) | (self.rows.used + count > self.most) | jnp.any(net != self.net)
+        stale = (count > few_among(points)) | (self.rows.used + count > self.most) | jnp.any(net != self.net)
 
         def sorted_anew() -> KeptRows:
             rows = rows_of(pieces, u, v, self.rows.point.shape[1], left_out)
@@ -60,7 +60,7 @@ class KeptRows(eqx.Module):
 
         def regrouped() -> KeptRows:
             old = self.rows
-            alone = rows_of_few(pieces, u, v, few_of(moved), count)
+            alone = rows_of_few(pieces, u, v, few_of(moved, few_among(points)), count)
             own = jnp.arange(alone.cell.shape[0], dtype=jnp.int32)
             own = jnp.where(own < count, own + old.used, old.cell.shape[0])
             gone = jnp.concatenate([moved, jnp.zeros(1, bool)])

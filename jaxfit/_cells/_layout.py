@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxfit._cells._polynomials import Jet, evaluate_jet, horner
 from jaxfit._cells._rows import Rows, make_rows
-from jaxfit._cells._stage import staged
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 
 def cells_of(pieces: Pieces, u: Any, v: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from jaxfit._closest._arrive import arrive as arrive
 from jaxfit._closest._arrive import third_derivatives as third_derivatives
-from jaxfit._closest._box import Box as Box
+from jaxfit._closest._box import RowBox as RowBox
 from jaxfit._closest._closest_point import ClosestPoint as ClosestPoint
 from jaxfit._closest._closest_point import PointStatus as PointStatus
 from jaxfit._closest._closest_point import closest_point as closest_point

@@ -9,7 +9,6 @@ and L = |ds| + |dt|, the surface is within M L^3 / 6 of R^ there and its tangent
 those of R^, which bounds the tangential part of the true residual.
 """
 
-import functools
 import math
 from typing import Any
 
@@ -17,12 +16,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._cells import Jet, in_line, staged
-from jaxfit._closest._box import Box, Sides
+from jaxfit._cells import Jet, in_line
+from jaxfit._closest._box import RowBox, Sides
 from jaxfit._closest._feet import INSIDE
 from jaxfit._closest._follow import pins_in_line, rowwise
 from jaxfit._closest._steps import Forms, dot, measure
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 LONGEST_GUESS = 1.0  # in local coordinates; farther off than that, the polynomial says nothing
 ROUNDING = 64.0  # of a squared distance, in units of the last place
@@ -47,12 +47,18 @@ def arrive(
     jet: Jet,
     u: Float[Array, " slots"],
     v: Float[Array, " slots"],
-    box: Box,
+    box: RowBox,
     third: Float[Array, "rows 1"],
     tolerance: Float[Array, ""],
     creased: bool,
-) -> tuple[Float[Array, " slots"], Float[Array, " slots"], Float[Array, "d slots"], Bool[Array, " slots"]]:
-    """Parameters of the feet, their residuals, and which of them are certain.
+) -> tuple[
+    Float[Array, " slots"],
+    Float[Array, " slots"],
+    Float[Array, "d slots"],
+    Bool[Array, " slots"],
+    Bool[Array, " slots"],
+]:
+    """Parameters of the feet, their residuals, which of them are certain, and which are in their row's cell.
 
     A foot that is not certain is left where the polynomial has it, to be looked at again there. The slots of
     all rows are in one line; `box` and `third`, the bound on the third derivatives, have one entry a row.
@@ -66,15 +72,15 @@ def arrive(
     ds, dt = staged(always, _solve, first, gs, gt, pinned_s, pinned_t, ds, dt)
     e = staged(always, _residual, e, jet, ds, dt)
 
-    def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array, Array, Array]:
+    def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array, Array, Array, Array]:
         return _landed(u, v, ds, dt, box.along_rows(), third)
 
     landing = staged(always, landed, *rowwise((u, v, ds, dt), box))
-    next_u, next_v, turned, inside = (in_line(x) for x in landing)
+    next_u, next_v, turned, inside, stays = (in_line(x) for x in landing)
     proven = staged(always, _is_proven, first, e, jet, ds, dt, pinned_s, pinned_t, turned, tolerance)
     if creased:  # what is held at a bound may have to go on behind it
         proven &= ~(pinned_s | pinned_t)
-    return next_u, next_v, e, inside & proven
+    return next_u, next_v, e, inside & proven, stays
 
 
 def _gradient(e: Array, jet: Jet, ds: Array, dt: Array) -> tuple[Array, Array]:
@@ -111,19 +117,25 @@ def _tangents(jet: Jet, ds: Array, dt: Array) -> tuple[Array, Array]:
 
 def _landed(
     u: Array, v: Array, ds: Array, dt: Array, box: Sides, third: Array
-) -> tuple[Array, Array, Array, Array]:
-    """The new parameters, how far the tangents are from the polynomial's, and whether it holds there."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The new parameters, how far the tangents are from the polynomial's, whether it holds all the way, and
+    whether the end is in the cell.
+    """
     next_u, next_v = u + ds * box.half_u, v + dt * box.half_v
     length = jnp.abs(ds) + jnp.abs(dt)
     # All the way: the bound on the third derivatives holds in the cell.
-    ends = (*box.local(u, v), *box.local(next_u, next_v))
-    inside = functools.reduce(jnp.logical_and, (jnp.abs(x) <= INSIDE for x in ends))
+    begins, stays = (_in_cell(*box.local(*x)) for x in ((u, v), (next_u, next_v)))
+    inside = begins & stays
     inside &= (next_u >= box.low_u) & (next_u <= box.high_u)
     inside &= (next_v >= box.low_v) & (next_v <= box.high_v)
     near = length < LONGEST_GUESS  # not where it is not a number
     next_u = jnp.where(near, jnp.clip(next_u, box.low_u, box.high_u), u)
     next_v = jnp.where(near, jnp.clip(next_v, box.low_v, box.high_v), v)
-    return next_u, next_v, 0.5 * third * length * length, inside
+    return next_u, next_v, 0.5 * third * length * length, inside, stays
+
+
+def _in_cell(s: Array, t: Array) -> Array:
+    return (jnp.abs(s) <= INSIDE) & (jnp.abs(t) <= INSIDE)
 
 
 def _is_proven(

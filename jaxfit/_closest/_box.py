@@ -34,36 +34,44 @@ class Sides(NamedTuple):
 
 
 class Box(eqx.Module):
-    """`Sides` in one array, of which each part of a computation fetches those that it needs."""
+    """`Sides` of slots in one array, of which each part of a computation fetches those that it needs."""
 
     sides: Float[Array, "10 *shape"]
 
+    def apart(self) -> Sides:
+        """One by one."""
+        return Sides(*self.sides)
+
+
+class RowBox(eqx.Module):
+    """`Sides` of cells, or of rows that lie in them. Those of a row lie side by side, as they are fetched:
+    any other order would be a copy for each part of a computation.
+    """
+
+    sides: Float[Array, "rows 10"]
+
     @staticmethod
-    def of_cells(pieces: Pieces) -> "Box":
+    def of_cells(pieces: Pieces) -> "RowBox":
         """Of all the cells."""
         along_u, along_v = (
-            jnp.concatenate([axis.bounds, 1.0 / axis.half[None]]) for axis in (pieces.axis_u, pieces.axis_v)
+            jnp.concatenate([axis.bounds, 1.0 / axis.half[None]]).T for axis in (pieces.axis_u, pieces.axis_v)
         )
-        cells = (5, pieces.axis_u.cells, pieces.axis_v.cells)
-        both = [jnp.broadcast_to(along_u[:, :, None], cells), jnp.broadcast_to(along_v[:, None], cells)]
-        return Box(jnp.concatenate(both).reshape(10, -1))
+        cells = (pieces.axis_u.cells, pieces.axis_v.cells, 5)
+        both = [jnp.broadcast_to(along_u[:, None], cells), jnp.broadcast_to(along_v[None], cells)]
+        return RowBox(jnp.concatenate(both, axis=2).reshape(-1, 10))
 
-    def of_rows(self, cell: Int[Array, " rows"]) -> "Box":
+    def of_rows(self, cell: Int[Array, " rows"]) -> "RowBox":
         """Of the cells of some rows."""
-        return Box(self.sides[:, cell])
+        return RowBox(self.sides[cell])
 
-    def within(self, border: Sequence[Array]) -> "Box":
+    def along_rows(self) -> Sides:
+        """One by one, each with a last axis to broadcast along rows."""
+        return Sides(*self.sides.T[..., None])
+
+    def within(self, border: Sequence[Array]) -> Box:
         """With bounds no wider than (low_u, high_u, low_v, high_v), each a number or given for every slot."""
         box, (low_u, high_u, low_v, high_v) = self.along_rows(), border
         low_u, high_u = jnp.maximum(box.low_u, low_u), jnp.minimum(box.high_u, high_u)
         low_v, high_v = jnp.maximum(box.low_v, low_v), jnp.minimum(box.high_v, high_v)
         sides = box._replace(low_u=low_u, high_u=high_u, low_v=low_v, high_v=high_v)
         return Box(jnp.stack(jnp.broadcast_arrays(*sides)))
-
-    def apart(self) -> Sides:
-        """One by one."""
-        return Sides(*self.sides)
-
-    def along_rows(self) -> Sides:
-        """One by one, each with a last axis to broadcast along rows."""
-        return Sides(*self.sides[..., None])

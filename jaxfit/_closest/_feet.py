@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._cells import jet_in_line, staged
+from jaxfit._cells import jet_in_line
 from jaxfit._closest._box import Box, Sides
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
+from jaxfit._stage import staged
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 2.0  # in local coordinates: a cell

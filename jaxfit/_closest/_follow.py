@@ -5,10 +5,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet, in_line, in_rows, staged
-from jaxfit._closest._box import Box, Sides
+from jaxfit._cells import Jet, in_line, in_rows
+from jaxfit._closest._box import RowBox, Sides
 from jaxfit._closest._feet import LONGEST_STEP, landing, pins, within
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
+from jaxfit._stage import staged
 
 
 def follow(
@@ -17,7 +18,7 @@ def follow(
     jet: Jet,
     u: Float[Array, " slots"],
     v: Float[Array, " slots"],
-    box: Box,
+    box: RowBox,
     tolerance: Float[Array, ""],
 ) -> tuple[Float[Array, " slots"], Float[Array, " slots"], Float[Array, "d slots"]]:
     r"""One step from feet near their own: where they land, and the residual foreseen there.
@@ -43,7 +44,7 @@ def follow(
 
 
 def pins_in_line(
-    always: Array, first: Forms, u: Array, v: Array, box: Box, tolerance: Array
+    always: Array, first: Forms, u: Array, v: Array, box: RowBox, tolerance: Array
 ) -> tuple[Array, Array, Array]:
     """`pins` for slots in line."""
     found = staged(
@@ -55,9 +56,9 @@ def pins_in_line(
     return pinned_s, pinned_t, settled
 
 
-def rowwise(x, box: Box):
+def rowwise(x, box: RowBox):
     """Everything in `x` in its rows, which `box` has one entry for."""
-    return jax.tree.map(lambda y: in_rows(y, box.sides.shape[1]), x)
+    return jax.tree.map(lambda y: in_rows(y, box.sides.shape[0]), x)
 
 
 def _shortened(

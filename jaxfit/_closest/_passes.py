@@ -19,7 +19,7 @@ from jaxfit._cells import (
     row_coefficients,
     row_width,
 )
-from jaxfit._closest._box import Box
+from jaxfit._closest._box import Box, RowBox
 from jaxfit._closest._creases import Home, at_home, cross_creases, home_cells
 from jaxfit._closest._feet import ARRIVED, Apart, Feet, Limits, advance, is_going
 from jaxfit._closest._steps import AbstractFootMethod
@@ -86,7 +86,7 @@ def _pass(
     steps = STEPS_PER_PASS if width > 1 else STEPS_ALONE
     on_cpu = jax.default_backend() == "cpu"
     size = min(count, SLOTS_PER_BLOCK // width, ROWS_PER_BLOCK) if on_cpu else count
-    boxes = Box.of_cells(pieces)
+    boxes = RowBox.of_cells(pieces)
 
     def block(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         start, feet = carry

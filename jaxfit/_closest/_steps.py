@@ -14,7 +14,8 @@ from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet, staged
+from jaxfit._cells import Jet
+from jaxfit._stage import staged
 
 # What a lifted eigenvalue of the Hessian, against the first form, is at least.
 LEAST_EIGENVALUE = 1e-3

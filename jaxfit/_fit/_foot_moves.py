@@ -16,24 +16,24 @@ from jaxtyping import Bool, Float
 from jaxfit._cells import (
     Jet,
     Rows,
-    evaluate_jet,
-    evaluate_values,
     in_line,
     in_rows,
-    row_coefficients,
-    staged,
+    jet_along_rows,
+    values_along_rows,
 )
-from jaxfit._closest import AbstractFootMethod, Box, Limits, arrive, follow, third_derivatives
+from jaxfit._closest import AbstractFootMethod, Limits, RowBox, arrive, follow, third_derivatives
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 
 class Moved(NamedTuple):
-    """Feet, their residuals, and which of them are where they belong."""
+    """Feet, their residuals, which of them are where they belong, and which are in their row's cell."""
 
     u: Float[Array, " slots"]
     v: Float[Array, " slots"]
     e: Float[Array, "d slots"]
     certain: Bool[Array, " slots"]
+    stays: Bool[Array, " slots"]
 
 
 class AbstractFootMove(eqx.Module):
@@ -47,7 +47,7 @@ class AbstractFootMove(eqx.Module):
 
     @abstractmethod
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: RowBox, target: Any, u: Any, v: Any
     ) -> Moved:
         """Move the feet (u, v) of `target`; `box` is that of the rows' cells."""
 
@@ -58,11 +58,12 @@ class Stay(AbstractFootMove):
     looks: ClassVar[int] = 1
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: RowBox, target: Any, u: Any, v: Any
     ) -> Moved:
         """Only the residuals are evaluated."""
-        values = _evaluated(evaluate_values, problem, pieces, part, box, u, v)
-        return Moved(u, v, target - in_line(values), jnp.ones(u.shape, bool))
+        values = _evaluated(values_along_rows, problem, pieces, part, box, u, v)
+        sure = jnp.ones(u.shape, bool)
+        return Moved(u, v, target - in_line(values), sure, sure)
 
 
 class Follow(AbstractFootMove):
@@ -73,13 +74,14 @@ class Follow(AbstractFootMove):
     looks: ClassVar[int] = 1
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: RowBox, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `follow`."""
-        jet = Jet(*map(in_line, _evaluated(evaluate_jet, problem, pieces, part, box, u, v)))
+        jet = Jet(*map(in_line, _evaluated(jet_along_rows, problem, pieces, part, box, u, v)))
         tolerance = problem.foot_tolerance * problem.diagonal
         moved = follow(self.method, target - jet.value, jet, u, v, box, tolerance)
-        return Moved(*moved, jnp.ones(u.shape, bool))
+        sure = jnp.ones(u.shape, bool)
+        return Moved(*moved, sure, sure)
 
 
 class Arrive(AbstractFootMove):
@@ -93,10 +95,10 @@ class Arrive(AbstractFootMove):
         return third_derivatives(pieces), Limits.of(wanted, problem.diagonal, 0).tolerance
 
     def __call__(
-        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: Box, target: Any, u: Any, v: Any
+        self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: RowBox, target: Any, u: Any, v: Any
     ) -> Moved:
         """See `arrive`."""
-        jet = Jet(*map(in_line, _evaluated(evaluate_jet, problem, pieces, part, box, u, v)))
+        jet = Jet(*map(in_line, _evaluated(jet_along_rows, problem, pieces, part, box, u, v)))
         (bounds, tolerance), creased = ready, pieces.axis_u.creased or pieces.axis_v.creased
         return Moved(
             *arrive(target - jet.value, jet, u, v, box, bounds[part.cell][:, None], tolerance, creased)
@@ -104,12 +106,11 @@ class Arrive(AbstractFootMove):
 
 
 def _evaluated(
-    evaluate: Callable[..., Any], problem: Any, pieces: Pieces, part: Rows, box: Box, u: Array, v: Array
+    evaluate: Callable[..., Any], problem: Any, pieces: Pieces, part: Rows, box: RowBox, u: Array, v: Array
 ) -> Any:
     """What `evaluate` makes of the rows' polynomials at the feet, in rows, each of its results once."""
 
-    def at_feet(coefficients: Array, box: Box, u: Array, v: Array) -> Any:
-        return evaluate(coefficients[..., None], *box.along_rows().local(u, v))
-
     u, v = (in_rows(x, part.cell.shape[0]) for x in (u, v))
-    return staged(problem.diagonal > 0, at_feet, row_coefficients(pieces, part), box, u, v)
+    always = problem.diagonal > 0
+    s, t = staged(always, lambda u, v: box.along_rows().local(u, v), u, v)
+    return staged(always, evaluate, pieces.coefficients[part.cell], s, t)

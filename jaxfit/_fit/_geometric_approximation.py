@@ -194,10 +194,10 @@ class GeometricApproximation(AbstractIterativeMethod):
 
         def one_pass() -> tuple[Measured, Pulls, Array]:
             move = Follow(self.foot_method) if self.foresees else Stay()
-            feet, _, pulls, active = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
-            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), feet)
+            pulled = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
+            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), pulled.feet)
             steps = jnp.where(exact, here.steps, 1) if self.foresees else here.steps
-            return Measured(u, v, error, steps, here.found, ahead=measured.ahead), pulls, active
+            return Measured(u, v, error, steps, here.found, ahead=measured.ahead), pulled.pulls, pulled.active
 
         def pulled() -> tuple[Measured, Pulls, Array]:
             if self.loss is not None:

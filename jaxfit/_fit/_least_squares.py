@@ -15,8 +15,8 @@ import lineax as lx
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._cells import staged
 from jaxfit._normal import NormalOperator, Stencil, System, free_points, normal_solver
+from jaxfit._stage import staged
 
 
 class Posed(eqx.Module):

@@ -33,11 +33,11 @@ from jaxfit._cells import (
     row_moments,
     row_width,
     rows_of,
-    staged,
 )
 from jaxfit._fit._free_tangents import FreeTangents
 from jaxfit._normal import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 
 class NormalRows(eqx.Module):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._cells import staged
 from jaxfit._checks import check_number, check_switches
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._growth import Growth, KnotInsertion, check_insertion
@@ -22,6 +21,7 @@ from jaxfit._fit._second_order import second_order_pull
 from jaxfit._fit._trust import Trust, farthest_move, is_plausible, next_damping, within_reach
 from jaxfit._normal import Stencil, coupled_cg, free_points, preconditioner, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+from jaxfit._stage import staged
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients

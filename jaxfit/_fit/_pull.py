@@ -6,7 +6,7 @@ it needs stays in a core's caches.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,10 +15,10 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._cells import (
-    FEW,
     SLOTS_PER_BLOCK,
     Rows,
     cells_to_net,
+    few_among,
     few_of,
     in_line,
     in_rows,
@@ -27,11 +27,11 @@ from jaxfit._cells import (
     row_moments,
     rows_of,
     rows_of_few,
-    staged,
 )
-from jaxfit._closest import Box
+from jaxfit._closest import RowBox
 from jaxfit._fit._foot_moves import AbstractFootMove, Moved
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 SLOTS_AGAIN = 256  # of a block of the few points that are looked at again, each in a row of its own
 
@@ -49,9 +49,32 @@ class Pulls(eqx.Module):
         return jnp.where(touched, self.sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
 
 
+class Pulled(NamedTuple):
+    """Feet and how they pull."""
+
+    feet: Float[Array, "3 points"]  # u, v and the length of the residual
+    looks: Int[Array, " points"]  # until the foot was certain, 0 where that failed
+    gone: Bool[Array, " points"]  # out of the cell of the row that held the point at first
+    pulls: Pulls
+    active: Int[Array, ""]  # how many points pull
+
+
 class _Pass(eqx.Module):
-    feet: Float[Array, "4 points"]  # u, v, the length of the residual, and the pass that found the foot, or 0
+    """`feet` are u, v, the length of the residual, and a mark: the number of the look that found the foot,
+    or 0, and if it has left its first cell half more, or -1.
+    """
+
+    feet: Float[Array, "4 points"]
     cells: Float[Array, "cells K Lc"]
+
+    @property
+    def found(self) -> Bool[Array, " points"]:
+        """Which feet are certain."""
+        return self.feet[3] > 0
+
+
+def _gone(mark: Array) -> Array:
+    return (mark < 0) | (mark > jnp.floor(mark))
 
 
 def pull(
@@ -64,9 +87,8 @@ def pull(
     weigh: Callable[[Array, Array], Array],
     move: AbstractFootMove,
     rows: Rows | None = None,
-) -> tuple[Float[Array, "3 points"], Int[Array, " points"], Pulls, Int[Array, ""]]:
-    """The feet with the lengths of their residuals, how many looks it took to be certain of each (0 where
-    that failed), the sums there, and how many points pull.
+) -> Pulled:
+    """Where the feet go, and the sums there.
 
     `idle` points have no part in it, and keep the `error` they have. `weigh(weight, error)` says how much
     points pull, each at the foot that it has after the `move`; those whose feet are not certain do not.
@@ -87,9 +109,9 @@ def pull(
         done = _in_looks(one, pieces, idle, rows, move.looks, begin)
     sums = cells_to_net(done.cells, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
     sums = _above_rounding(sums, pieces.order)
-    pulling = (weigh(problem.weight, done.feet[2]) > 0) & (done.feet[3] > 0)
-    active = jnp.sum(pulling, dtype=jnp.int32)
-    return done.feet[:3], done.feet[3].astype(jnp.int32), Pulls(sums), active
+    active = jnp.sum((weigh(problem.weight, done.feet[2]) > 0) & done.found, dtype=jnp.int32)
+    looks = jnp.maximum(done.feet[3], 0.0).astype(jnp.int32)
+    return Pulled(done.feet[:3], looks, _gone(done.feet[3]), Pulls(sums), active)
 
 
 def _above_rounding(sums: Array, order: tuple[int, int]) -> Array:
@@ -98,8 +120,9 @@ def _above_rounding(sums: Array, order: tuple[int, int]) -> Array:
     What rounds a sum is as large as those of the control points with which it shares a cell.
     """
     total = lax.stop_gradient(sums[..., -1:])
-    window = (2 * order[0] - 1, 2 * order[1] - 1, 1)
-    largest = lax.reduce_window(total, 0.0, lax.max, window, (1, 1, 1), "SAME")
+    largest = total
+    for window in ((2 * order[0] - 1, 1, 1), (1, 2 * order[1] - 1, 1)):
+        largest = lax.reduce_window(largest, 0.0, lax.max, window, (1, 1, 1), "SAME")
     return jnp.where(total > jnp.finfo(sums.dtype).eps ** 0.75 * largest, sums, 0.0)
 
 
@@ -111,7 +134,9 @@ def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begi
     """
 
     def left(done: _Pass) -> Array:
-        return ~idle & (done.feet[3] <= 0)
+        return ~idle & ~done.found
+
+    few = few_among(idle.shape[0])
 
     def unfinished(carry: tuple[Array, _Pass]) -> Array:
         return (carry[0] < most) & jnp.any(left(carry[1]))
@@ -120,7 +145,7 @@ def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begi
         look, done = carry[0] + 1, carry[1]
         mine, (u, v) = left(done), done.feet[:2]
         count, first = jnp.sum(mine, dtype=jnp.int32), look == 1
-        many = first | (count > FEW)
+        many = first | (count > few)
 
         def anew() -> Rows:
             return rows_of(pieces, u, v, rows.point.shape[1], ~mine)
@@ -130,7 +155,7 @@ def _in_looks(one: Any, pieces: Pieces, idle: Array, rows: Rows, most: int, begi
 
         shared = lax.cond(first, lambda: rows, lambda: lax.cond(many, anew, none))
         done = one(shared, SLOTS_PER_BLOCK, look, done)
-        alone = rows_of_few(pieces, u, v, few_of(mine), jnp.where(many, 0, count))
+        alone = rows_of_few(pieces, u, v, few_of(mine, few), jnp.where(many, 0, count))
         return look, one(alone, SLOTS_AGAIN, look, done)
 
     return lax.while_loop(unfinished, another, (jnp.asarray(0, jnp.int32), begin))[1]
@@ -149,7 +174,7 @@ def _one_pass(
 ) -> _Pass:
     """Move the feet in `rows` from where they are, and add up how they pull."""
     (order_u, order_v), always = pieces.order, problem.diagonal > 0
-    boxes = Box.of_cells(pieces)
+    boxes = RowBox.of_cells(pieces)
 
     def add(part: Rows, filled: Array, done: _Pass) -> _Pass:
         box = boxes.of_rows(part.cell)
@@ -160,7 +185,7 @@ def _one_pass(
         error = staged(always, lambda e: jnp.sqrt(sum(x * x for x in e)), moved.e)
 
         def summands(
-            old: tuple[Array, Array], new: Moved, error: Array, given: Array, box: Box
+            old: tuple[Array, Array], new: Moved, error: Array, given: Array, box: RowBox
         ) -> tuple[Array, Array, Array]:
             pulls = new.certain
             weight = jnp.where(pulls, weigh(given, error), 0.0)
@@ -176,9 +201,11 @@ def _one_pass(
         x = jax.tree.map(lambda y: in_rows(y, part.cell.shape[0]), x)
         s, t, values = staged(always, summands, *x, box)
         moments = row_moments(s, t, values, order_u, order_v)
-        found = jnp.where(moved.certain, look, 0).astype(error.dtype)
+        gone = (~moved.stays | _gone(feet[3])).astype(error.dtype)
+        mark = jnp.where(moved.certain, look + 0.5 * gone, -gone)
         point = in_line(jnp.where(filled, part.point, part.points))
-        feet = done.feet.at[:, point].set(jnp.stack([moved.u, moved.v, error, found]), mode="drop")
+        feet = jnp.stack([moved.u, moved.v, error, mark])
+        feet = done.feet.at[:, point].set(feet, mode="drop")
         return _Pass(feet, done.cells.at[part.cell].add(moments))
 
     return over_blocks(rows, add, begin, slots)

@@ -27,11 +27,11 @@ from jaxfit._cells import (
     row_moments,
     row_width,
     rows_of,
-    staged,
 )
 from jaxfit._closest import dot
 from jaxfit._fit._free_tangents import FreeTangents
 from jaxfit._splines._pieces import Pieces
+from jaxfit._stage import staged
 
 NEAR = 0.5  # the share of the first form that must be left in the Hessian
 

@@ -22,12 +22,12 @@ from jaxfit._cells import (
     row_coefficients,
     row_width,
     rows_of,
-    staged,
 )
 from jaxfit._normal._moments import normal_stencil
 from jaxfit._normal._stencil import Stencil
 from jaxfit._normal._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+from jaxfit._stage import staged
 
 SCARCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
 

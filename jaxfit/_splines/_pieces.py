@@ -19,8 +19,11 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
+from jaxfit._stage import staged
 
 Numbers = Array | np.ndarray
+
+UNROLLED = 30  # terms of a sum
 
 
 class Axis(eqx.Module):
@@ -88,16 +91,15 @@ class Axis(eqx.Module):
 def _last_not_above(breaks: Float[Array, " breaks"], u: Float[Array, "..."]) -> Int[Array, "..."]:
     """The last i with breaks[i] <= u, by counting: every so many breaks, then those between.
 
-    Two short sums without memory between compile and run faster than bisection.
+    Two short sums without memory between compile and run faster than bisection. The first costs least, up to
+    the length that is compiled without a loop.
     """
     count = breaks.shape[0]
-    stride = max(1, math.isqrt(count))
-    column = (-1,) + (1,) * u.ndim
-    coarse = jnp.sum(breaks[::stride].reshape(column) <= u[None], axis=0, dtype=jnp.int32) - 1
-    first = jnp.maximum(coarse, 0) * stride
-    number = first[None] + jnp.arange(1, stride, dtype=jnp.int32).reshape(column)
-    passed = (breaks[jnp.minimum(number, count - 1)] <= u[None]) & (number < count)
-    return first + jnp.sum(passed, axis=0, dtype=jnp.int32)
+    stride = min(math.isqrt(count), -(-count // UNROLLED))
+    coarse = breaks[::stride].reshape((-1,) + (1,) * u.ndim) <= u[None]
+    first = jnp.maximum(jnp.sum(coarse, axis=0, dtype=jnp.int32) - 1, 0) * stride
+    padded = jnp.concatenate([breaks, jnp.full(stride, jnp.inf, breaks.dtype)])
+    return first + sum((padded[first + i] <= u).astype(jnp.int32) for i in range(1, stride))
 
 
 class Pieces(eqx.Module):
@@ -226,10 +228,17 @@ def pieces_on(control_points: Float[Numbers, "nu nv d"], axis_u: Axis, axis_v: A
     if concrete:
         poly_u, poly_v, control_points = (np.asarray(x) for x in (poly_u, poly_v, control_points))
     (cells_u, order_u, _), (cells_v, order_v, _) = poly_u.shape, poly_v.shape
-    # One direction at a time, as sums of shifted slices: no gather, and XLA fuses the lot.
-    rows: Any = sum(
-        poly_u[:, r, :, None, None] * control_points[r : r + cells_u, None] for r in range(order_u)
-    )
+
+    # One direction at a time, as sums of shifted slices: no gather, and XLA fuses each.
+    def along_u(poly_u: Any, control_points: Any) -> Any:
+        return sum(
+            poly_u[:, r, :, None, None] * control_points[r : r + cells_u, None] for r in range(order_u)
+        )
+
+    if concrete:
+        rows = along_u(poly_u, control_points)
+    else:
+        rows = staged(~(axis_u.breaks[0] > axis_u.breaks[-1]), along_u, poly_u, control_points)
     both: Any = sum(
         rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :] for r in range(order_v)
     )
