@@ -29,9 +29,9 @@ jax.config.update("jax_enable_x64", True)
 import helpers
 from normal_reference import squares
 
-from jaxfit._fit._least_squares import GaussNewton, StructuredSolver, posed
+from jaxfit._approximation._least_squares import GaussNewton, StructuredSolver, posed
 from jaxfit._fit._measure import border
-from jaxfit._normal import make_system
+from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
 
 try:

@@ -33,7 +33,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import jaxfit as jf
-from jaxfit._normal import curvature_energy
+from jaxfit._normal_equations import curvature_energy
 
 TARGETS = {"mq": 6e-4, "cm": 2e-4}
 LAMBDAS = {"mq": 5e-6, "igea_face": 1e-6, "mountain": 5e-6, "mannequin_head": 5e-6}

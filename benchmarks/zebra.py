@@ -16,8 +16,8 @@ import helpers
 import numpy as np
 
 import jaxfit as jf
+from jaxfit._approximation._standard import bending_energy
 from jaxfit._fit._problem import axes_of
-from jaxfit._fit._standard_approximation import bending_energy
 from jaxfit.plot import zebra_stripes
 
 METHODS = {

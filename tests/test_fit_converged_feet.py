@@ -7,10 +7,10 @@ import pytest
 from helpers import eps, random_surface, wavy_cloud, wavy_surface
 
 import jaxfit as jf
+from jaxfit._approximation._control_point_sums import _above_rounding, pull
+from jaxfit._approximation._foot_updates import Arrive
 from jaxfit._cells import KeptRows, cells_of
-from jaxfit._fit._foot_moves import Arrive
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._pull import _above_rounding, pull
 from jaxfit._splines._pieces import make_pieces
 
 POINTS, EDGES = wavy_cloud(1500)

@@ -7,7 +7,7 @@ import pytest
 from helpers import count_compilations, wavy_cloud
 
 import jaxfit as jf
-from jaxfit._fit._growth import refined, with_room
+from jaxfit._approximation._knot_insertion import refined, with_room
 from jaxfit._fit._problem import axes_of
 
 POINTS, EDGES = wavy_cloud(500, height=0.3)

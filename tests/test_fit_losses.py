@@ -7,7 +7,7 @@ import pytest
 from helpers import diagonal, wavy_cloud
 
 import jaxfit as jf
-from jaxfit._fit._losses import reweighted, total_cost
+from jaxfit._approximation._losses import reweighted, total_cost
 
 POINTS, EDGES = wavy_cloud(500)
 LOSSES = [jf.Huber(), jf.Tukey(), jf.GemanMcClure()]

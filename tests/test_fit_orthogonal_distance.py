@@ -9,11 +9,11 @@ from helpers import data, diagonal, eps, wavy_cloud
 from normal_reference import thin_plate_matrix
 
 import jaxfit as jf
-from jaxfit._fit._normal_rows import normal_rows
+from jaxfit._approximation._damping import LEAST_DAMPING, first_trust, next_damping, within_reach
+from jaxfit._approximation._distance_rows import normal_rows
+from jaxfit._approximation._second_order import second_order_pull
 from jaxfit._fit._problem import axes_of, make_problem, unit_of
-from jaxfit._fit._second_order import second_order_pull
-from jaxfit._fit._trust import LEAST_DAMPING, first_trust, next_damping, within_reach
-from jaxfit._normal import coupled_cg, preconditioner
+from jaxfit._normal_equations import coupled_cg, preconditioner
 from jaxfit._splines._pieces import pieces_on
 
 POINTS, EDGES = wavy_cloud(500)

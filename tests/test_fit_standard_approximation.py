@@ -8,10 +8,10 @@ from helpers import count_compilations, eps, wavy_cloud
 from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
-from jaxfit._fit._automatic_smoothing import Candidates
-from jaxfit._fit._least_squares import StructuredSolver, posed
+from jaxfit._approximation._automatic_smoothing import Candidates
+from jaxfit._approximation._least_squares import StructuredSolver, posed
 from jaxfit._fit._measure import border
-from jaxfit._normal import make_system
+from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
 
 POINTS, EDGES = wavy_cloud(500)

@@ -8,7 +8,7 @@ from helpers import clamped_uniform, eps, random_clamped_knots
 from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
-from jaxfit._normal import _moments, curvature_energy, make_system, thin_plate
+from jaxfit._normal_equations import _moments, curvature_energy, make_system, thin_plate
 from jaxfit._splines._pieces import make_axis, make_pieces
 
 

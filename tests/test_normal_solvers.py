@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_normal_matrices import surface_of, system_of
 
-from jaxfit._normal import BlockCholesky, NormalOperator, Stencil, TensorCG, free_points
+from jaxfit._normal_equations import BlockCholesky, NormalOperator, Stencil, TensorCG, free_points
 
 
 @pytest.fixture(scope="module")

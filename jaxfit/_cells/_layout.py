@@ -8,10 +8,10 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int, Shaped
 
+from jaxfit._barrier import materialise
 from jaxfit._cells._polynomials import Jet, evaluate_jet, horner
 from jaxfit._cells._rows import Rows, make_rows
 from jaxfit._splines._pieces import Pieces
-from jaxfit._stage import staged
 
 
 def cells_of(pieces: Pieces, u: Any, v: Any) -> Any:
@@ -51,9 +51,9 @@ def jet_in_line(
     s: Float[Array, " slots"],
     t: Float[Array, " slots"],
 ) -> Jet:
-    """Value and derivatives in every slot, each evaluated once (`staged`)."""
+    """Value and derivatives in every slot, each evaluated once (`materialise`)."""
     rows = coefficients.shape[-1]
-    jet = staged(
+    jet = materialise(
         always,
         lambda c, s, t: evaluate_jet(c[..., None], s, t),
         coefficients,

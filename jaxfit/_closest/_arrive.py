@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import Jet, in_line
 from jaxfit._closest._box import RowBox, Sides
 from jaxfit._closest._feet import INSIDE
 from jaxfit._closest._follow import pins_in_line, rowwise
 from jaxfit._closest._steps import Forms, dot, measure
 from jaxfit._splines._pieces import Pieces
-from jaxfit._stage import staged
 
 LONGEST_GUESS = 1.0  # in local coordinates; farther off than that, the polynomial says nothing
 ROUNDING = 64.0  # of a squared distance, in units of the last place
@@ -64,20 +64,20 @@ def arrive(
     all rows are in one line; `box` and `third`, the bound on the third derivatives, have one entry a row.
     """
     always = tolerance < jnp.inf
-    first = staged(always, lambda e, jet: measure(e, jet, False), e, jet)
+    first = materialise(always, lambda e, jet: measure(e, jet, False), e, jet)
     pinned_s, pinned_t, _ = pins_in_line(always, first, u, v, box, tolerance)
-    ds, dt = staged(always, _solve, first, first.gradient_s, first.gradient_t, pinned_s, pinned_t)
+    ds, dt = materialise(always, _solve, first, first.gradient_s, first.gradient_t, pinned_s, pinned_t)
     # The same matrix once more, on the polynomial: convergence of order three for one evaluation.
-    gs, gt = staged(always, _gradient, e, jet, ds, dt)
-    ds, dt = staged(always, _solve, first, gs, gt, pinned_s, pinned_t, ds, dt)
-    e = staged(always, _residual, e, jet, ds, dt)
+    gs, gt = materialise(always, _gradient, e, jet, ds, dt)
+    ds, dt = materialise(always, _solve, first, gs, gt, pinned_s, pinned_t, ds, dt)
+    e = materialise(always, _residual, e, jet, ds, dt)
 
     def landed(u: Array, v: Array, ds: Array, dt: Array) -> tuple[Array, Array, Array, Array, Array]:
         return _landed(u, v, ds, dt, box.along_rows(), third)
 
-    landing = staged(always, landed, *rowwise((u, v, ds, dt), box))
+    landing = materialise(always, landed, *rowwise((u, v, ds, dt), box))
     next_u, next_v, turned, inside, stays = (in_line(x) for x in landing)
-    proven = staged(always, _is_proven, first, e, jet, ds, dt, pinned_s, pinned_t, turned, tolerance)
+    proven = materialise(always, _is_proven, first, e, jet, ds, dt, pinned_s, pinned_t, turned, tolerance)
     if creased:  # what is held at a bound may have to go on behind it
         proven &= ~(pinned_s | pinned_t)
     return next_u, next_v, e, inside & proven, stays

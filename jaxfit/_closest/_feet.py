@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import jet_in_line
 from jaxfit._closest._box import Box, Sides
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
-from jaxfit._stage import staged
 
 MOST_HALVINGS = 40
 LONGEST_STEP = 2.0  # in local coordinates: a cell
@@ -211,7 +211,9 @@ def _measure_at(
     """The inner products at the trials."""
     s, t = box.apart().local(u, v)
     jet = jet_in_line(always, coefficients, s, t)
-    return staged(always, lambda target, jet: measure(target - jet.value, jet, method.drift), target, jet)
+    return materialise(
+        always, lambda target, jet: measure(target - jet.value, jet, method.drift), target, jet
+    )
 
 
 def _next_trial(
@@ -232,8 +234,8 @@ def _next_trial(
     always = limits.tolerance < jnp.inf
     pinned_s, pinned_t, settled = pins(first, u, v, box.apart(), limits.tolerance)
     ds, dt = method.step(first, pinned_s, pinned_t, late, always)
-    ds, dt = staged(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
-    return staged(always, _foresee, first, u, v, ds, dt, best, box, limits)
+    ds, dt = materialise(always, _downhill, first, u, v, ds, dt, pinned_s, pinned_t, settled, box)
+    return materialise(always, _foresee, first, u, v, ds, dt, best, box, limits)
 
 
 def _foresee(

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import Jet, in_line, in_rows
 from jaxfit._closest._box import RowBox, Sides
 from jaxfit._closest._feet import LONGEST_STEP, landing, pins, within
 from jaxfit._closest._steps import AbstractFootMethod, Forms, measure
-from jaxfit._stage import staged
 
 
 def follow(
@@ -28,7 +28,7 @@ def follow(
     has one entry a row.
     """
     always = tolerance < jnp.inf
-    first = staged(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
+    first = materialise(always, lambda e, jet: measure(e, jet, method.drift), e, jet)
     pinned_s, pinned_t, settled = pins_in_line(always, first, u, v, box, tolerance)
     ds, dt = method.step(first, pinned_s, pinned_t, settled, always)
 
@@ -39,7 +39,7 @@ def follow(
         return next_u, landing(v, dt, sides.low_v, sides.high_v, sides.half_v, sides.rate_v), ds, dt
 
     x = rowwise((first, u, v, ds, dt, settled), box)
-    next_u, next_v, ds, dt = (in_line(x) for x in staged(always, landed, *x))
+    next_u, next_v, ds, dt = (in_line(x) for x in materialise(always, landed, *x))
     return next_u, next_v, e - ds[None] * jet.s - dt[None] * jet.t
 
 
@@ -47,7 +47,7 @@ def pins_in_line(
     always: Array, first: Forms, u: Array, v: Array, box: RowBox, tolerance: Array
 ) -> tuple[Array, Array, Array]:
     """`pins` for slots in line."""
-    found = staged(
+    found = materialise(
         always,
         lambda first, u, v: pins(first, u, v, box.along_rows(), tolerance),
         *rowwise((first, u, v), box),

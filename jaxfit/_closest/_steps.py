@@ -14,8 +14,8 @@ from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import Jet
-from jaxfit._stage import staged
 
 # What a lifted eigenvalue of the Hessian, against the first form, is at least.
 LEAST_EIGENVALUE = 1e-3
@@ -74,7 +74,7 @@ class AbstractFootMethod(eqx.Module):
     ) -> tuple[Array, Array]:
         """The step in local coordinates; a pinned coordinate does not move.
 
-        Where it is `late`, a method that converges linearly takes Newton's step; `always` is for `staged`.
+        Where it is `late`, a method that converges linearly takes a Newton step.
         """
 
 
@@ -92,7 +92,7 @@ class Newton(AbstractFootMethod):
         self, first: Forms, pinned_s: Array, pinned_t: Array, late: Array, always: Array
     ) -> tuple[Array, Array]:
         """Solve the 2x2 system with the Hessian, made positive where it is not."""
-        return staged(always, self._step, first, pinned_s, pinned_t)
+        return materialise(always, self._step, first, pinned_s, pinned_t)
 
     def _step(self, first: Forms, pinned_s: Array, pinned_t: Array) -> tuple[Array, Array]:
         E, F, G = first.E, first.F, first.G
@@ -129,8 +129,8 @@ class HuWallner(AbstractFootMethod):
     ) -> tuple[Array, Array]:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""
         newton_s, newton_t = Newton().step(first, pinned_s, pinned_t, late, always)
-        ds, dt = staged(always, _tangent_plane, first, pinned_s, pinned_t)
-        factor, trusted = staged(always, self._factor, first, ds, dt)
+        ds, dt = materialise(always, _tangent_plane, first, pinned_s, pinned_t)
+        factor, trusted = materialise(always, self._factor, first, ds, dt)
         circle = trusted & ~late
         return jnp.where(circle, factor * ds, newton_s), jnp.where(circle, factor * dt, newton_t)
 

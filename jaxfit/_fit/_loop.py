@@ -18,12 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._ahead import Ahead
-from jaxfit._fit._growth import Growth
-from jaxfit._fit._nesterov import Momentum, at_rest
-from jaxfit._fit._pull import Pulls
-from jaxfit._fit._results import RESULTS
-from jaxfit._fit._trust import Trust, first_trust
+from jaxfit._fit._reasons import RESULTS
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
@@ -42,9 +37,9 @@ class Measured(eqx.Module):
     steps: Int[Any, " points"]
     found: Bool[Any, " points"]
     active: Int[Any, ""] | None = None  # points of a cloud that play a part
-    pulls: Pulls | None = None  # of methods that gather them while they measure
+    pulls: Any = None  # of methods that gather them while they measure
     poor: Bool[Any, " points"] | None = None  # of methods that mark points that are, or were, too far away
-    ahead: Ahead | None = None  # of methods whose feet start from where their last move leads
+    ahead: Any = None  # of methods whose feet start from where their last move leads
 
 
 class Limits(eqx.Module):
@@ -102,10 +97,10 @@ class Turn(eqx.Module):
     net: Float[Any, "nu nv d"]
     step: Int[Any, ""]
     records: Records
-    growth: Growth | None = None  # of a net that gets more knots on the way
+    growth: Any = None  # of a net that gets more knots on the way
     shift: Float[Any, ""] | None = None  # most that a singular system has been shifted, where any is solved
-    trust: Trust | None = None  # of methods that may take a step back
-    momentum: Momentum | None = None  # of methods that are accelerated
+    trust: Any = None  # of methods that may take a step back
+    momentum: Any = None  # of methods that are accelerated
 
     def axes(self, problem: Any) -> tuple[Axis, Axis]:
         """Both directions of the knots."""
@@ -130,7 +125,7 @@ class Carry(eqx.Module):
     code: Int[Any, ""]
     best: Best | None  # for methods that may wander off
     exact: Bool[Any, ""]  # whether `next` is to be measured with feet converged
-    growth: Growth | None  # of `net`
+    growth: Any  # of `net`
 
 
 class AbstractIterativeMethod(eqx.Module):
@@ -201,12 +196,17 @@ def begin(
     v: Any,
     most: int,
     problem: Any,
-    growth: Growth | None = None,
+    growth: Any = None,
 ) -> Carry:
     """Before anything is measured; the history holds up to `most` + 1 entries.
 
     `growth` is that of a net with room for more.
     """
+    from jaxfit._approximation._control_point_sums import Pulls
+    from jaxfit._approximation._damping import first_trust
+    from jaxfit._approximation._extrapolation import Ahead
+    from jaxfit._approximation._nesterov import at_rest
+
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)
     number = partial(xp.asarray, dtype=np.int32)

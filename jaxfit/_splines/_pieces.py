@@ -18,8 +18,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
+from jaxfit._barrier import materialise
 from jaxfit._checks import is_concrete
-from jaxfit._stage import staged
 
 Numbers = Array | np.ndarray
 
@@ -238,7 +238,7 @@ def pieces_on(control_points: Float[Numbers, "nu nv d"], axis_u: Axis, axis_v: A
     if concrete:
         rows = along_u(poly_u, control_points)
     else:
-        rows = staged(~(axis_u.breaks[0] > axis_u.breaks[-1]), along_u, poly_u, control_points)
+        rows = materialise(~(axis_u.breaks[0] > axis_u.breaks[-1]), along_u, poly_u, control_points)
     both: Any = sum(
         rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :] for r in range(order_v)
     )

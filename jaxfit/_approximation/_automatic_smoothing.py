@@ -1,0 +1,194 @@
+r"""Choosing lambda from the data, with the parameters of the points held.
+
+Then the fit is linear in the data, $A P = H(\lambda) Q$, and each lambda takes one factorisation of
+$S + \lambda A_{fair}$, S being the normal matrix of the data. It gives the sum of squares that remains,
+$|Q - A P|^2$, in space counted along the normals only, since what remains along the surface goes when the
+parameters are corrected; and the number of parameters in effect,
+$\operatorname{tr} H = \operatorname{tr} S (S + \lambda A_{fair})^{-1}$, estimated from random signs.
+"""
+
+from abc import abstractmethod
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._approximation._least_squares import posed
+from jaxfit._cells import evaluate_jet, row_coefficients
+from jaxfit._checks import check_number
+from jaxfit._fit._loop import Limits, Measured
+from jaxfit._normal_equations import BlockCholesky, NormalOperator, System, free_points
+from jaxfit._splines._pieces import pieces_on
+
+DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same trace
+
+
+class Candidates(eqx.Module):
+    """Several lambdas in increasing order, and what remains of the data for each."""
+
+    smoothing: Float[Array, " lambdas"]
+    remaining: Float[Array, " lambdas"]  # sum of squares, weighted
+    effective: Float[Array, " lambdas"]  # number of parameters, for each coordinate
+    points: Float[Array, ""]
+
+
+class AbstractSmoothing(eqx.Module):
+    """A rule that chooses lambda, out of `candidates`, in as many `rounds`."""
+
+    @abstractmethod
+    def best(self, candidates: Candidates) -> Float[Array, ""]:
+        """The lambda to take."""
+
+
+class GeneralizedCrossValidation(AbstractSmoothing):
+    r"""The lambda that would predict left-out points best.
+
+    That is the least $|Q - A P|^2 / (N - \operatorname{tr} H)^2$ over N points.
+
+    Needs nothing to be known of the noise, but that it is independent from point to point, and parameters
+    that do not follow it. Those on a base made with the points (`Meshless`) do where the noise is as large as
+    the distances between points; lambda is then chosen too small, by orders of magnitude, and
+    `Discrepancy` is the better choice. Golub, Heath and Wahba, Technometrics 21 (1979).
+
+    Parameters
+    ----------
+    candidates : int
+        Lambdas tried, evenly in their logarithm over twelve decades; a parabola goes through the best three.
+    rounds : int
+        How often: at the first parameters, and again at those corrected on the surface found.
+    """
+
+    candidates: int = 17
+    rounds: int = 2
+
+    def __check_init__(self) -> None:
+        _check_counts(self)
+
+    def best(self, candidates: Candidates) -> Float[Array, ""]:
+        """The minimum, interpolated."""
+        return _cross_validated(candidates)
+
+
+class Discrepancy(AbstractSmoothing):
+    """The largest lambda that leaves no more than the noise: the discrepancy principle of Morozov.
+
+    Where even the least leaves more, the net and not lambda sets what remains, and the principle is silent:
+    then as `GeneralizedCrossValidation` chooses.
+
+    Parameters
+    ----------
+    noise : float
+        Standard deviation of the distance between a point of weight 1 and the true surface, as a fraction of
+        the diagonal of the data's bounding box.
+    candidates, rounds : int
+        As for GeneralizedCrossValidation.
+    """
+
+    noise: float
+    candidates: int = 17
+    rounds: int = 2
+
+    def __check_init__(self) -> None:
+        check_number("noise", self.noise, 0.0)
+        _check_counts(self)
+
+    def best(self, candidates: Candidates) -> Float[Array, ""]:
+        """Where the remaining sum of squares passes that of the noise."""
+        goal = jnp.log(candidates.points) + 2.0 * np.log(max(self.noise, 1e-30))
+        remaining = lax.cummax(jnp.log(candidates.remaining))
+        passed = jnp.exp(jnp.interp(goal, remaining, jnp.log(candidates.smoothing)))
+        return jnp.where(remaining[0] <= goal, passed, _cross_validated(candidates))
+
+
+def _cross_validated(candidates: Candidates) -> Float[Array, ""]:
+    left = 1.0 - candidates.effective / candidates.points
+    score = jnp.log(candidates.remaining) - 2.0 * jnp.log(jnp.maximum(left, 1e-3))
+    k = jnp.clip(jnp.argmin(score), 1, score.shape[0] - 2)
+    low, middle, high = score[k - 1], score[k], score[k + 1]
+    bend = low - 2.0 * middle + high
+    offset = jnp.where(bend > 0, 0.5 * (low - high) / jnp.where(bend > 0, bend, 1.0), 0.0)
+    logarithm = jnp.log(candidates.smoothing)
+    step = logarithm[1] - logarithm[0]
+    return jnp.exp(logarithm[k] + jnp.clip(offset, -1.0, 1.0) * step)
+
+
+def _check_counts(rule: Any) -> None:
+    check_number("candidates", rule.candidates, 3, whole=True)
+    check_number("rounds", rule.rounds, 1, whole=True)
+
+
+PROBES = 16
+
+
+def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int) -> Candidates:
+    """All candidates, on the problem of improving `net`; one factorisation for each."""
+    data, plate = system.data_stencil(), system.plate.stencil()
+    free = free_points(data.plus(plate, 1.0), held)
+    mask = jnp.asarray(free)[:, :, None]
+    traces = [jnp.sum(jnp.where(free, x.diagonal, 0.0)) for x in (data, plate)]
+    tiny = jnp.finfo(net.dtype).tiny
+    decades = jnp.asarray(np.linspace(*DECADES, count), net.dtype)
+    smoothing = 10.0**decades * traces[0] / jnp.maximum(traces[1], tiny)
+    residual = system.data_residual(net)
+    nothing = tuple(0.0 * x for x in system.plate.residual(net))
+    pull = jnp.where(mask, -system.adjoint((residual, (nothing[0], nothing[1], nothing[2]))), 0.0)
+    bend = jnp.where(mask, -plate(net), 0.0)
+    signs = np.random.default_rng(0).integers(0, 2, (*net.shape[:2], PROBES)) * 2.0 - 1.0
+    probes = jnp.where(mask, jnp.asarray(signs, net.dtype), 0.0)
+    d = net.shape[2]
+    normal = _normals(system, net) if d == 3 else None
+
+    def one(value: Array) -> tuple[Array, Array]:
+        operator = NormalOperator(data.plus(plate, value), free, d + PROBES)
+        solver = BlockCholesky()
+        right = jnp.concatenate([pull + value * bend, probes], axis=2)
+        solution, _, _ = solver.compute(solver.init(operator, {}), right, {})
+        left = system.data_residual(net + solution[:, :, :d])
+        across = left if normal is None else jnp.sum(normal * left, axis=0)
+        return jnp.sum(across**2), jnp.sum(probes * data(solution[:, :, d:])) / PROBES
+
+    remaining, effective = lax.map(one, smoothing)
+    remaining = jnp.maximum(remaining, tiny)
+    points = jnp.sum(system.root > 0).astype(net.dtype)
+    return Candidates(smoothing, remaining, effective, points)
+
+
+def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
+    """Unit normals at the points' parameters; 0 where there is none."""
+    pieces = pieces_on(net, system.axis_u, system.axis_v)
+    jet = evaluate_jet(row_coefficients(pieces, system.rows)[..., None], system.s, system.t)
+    normal = jnp.cross(jet.s, jet.t, axis=0)
+    square = jnp.sum(normal**2, axis=0)
+    return normal * jnp.where(square > 0, lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)[None]
+
+
+@partial(jax.jit, static_argnames=("rule", "method"))
+def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> Array:
+    """The lambda for a fit that starts from a net and its feet.
+
+    Each round solves with the lambda it has found, and corrects the parameters.
+    """
+    none = jnp.zeros(u.shape, jnp.int32)
+    measured = Measured(u, v, jnp.zeros_like(u), none, none > 0, jnp.asarray(0, jnp.int32))
+    held = method.held((problem.axis_u, problem.axis_v), net)
+    diagonal = problem.diagonal
+    limits = Limits(diagonal, diagonal, jnp.asarray(1, jnp.int32))  # nothing stops here
+
+    def one(_: Any, carry: tuple[Array, Measured, Array]) -> tuple[Array, Measured, Array]:
+        net, measured, _ = carry
+        system = method.system(problem, pieces_on(net, problem.axis_u, problem.axis_v), measured)
+        candidates = tried(system, held, net, rule.candidates)
+        scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
+        smoothing = rule.best(scaled)
+        system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
+        net, _ = method.solver(posed(system, held, net))
+        pieces = pieces_on(net, problem.axis_u, problem.axis_v)
+        return net, method.measure(problem, limits, pieces, measured, jnp.asarray(True)), smoothing
+
+    rounds = rule.rounds if method.parameter_correction else 1
+    return lax.fori_loop(0, rounds, one, (net, measured, jnp.zeros((), net.dtype)))[2]

@@ -1,0 +1,91 @@
+"""What is asked of a fit of scattered points, checked before anything is computed."""
+
+from typing import Any
+
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from jaxfit._approximation._geometric import GeometricApproximation
+from jaxfit._approximation._orthogonal import OrthogonalDistance
+from jaxfit._approximation._standard import StandardApproximation
+from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
+from jaxfit._fit._problem import Unit, unit_of
+
+ApproximationMethod = GeometricApproximation | OrthogonalDistance | StandardApproximation
+
+OUTSIDE = 1e-4  # of the domain: how far out a foot to start from may be
+
+
+def checked_request(
+    points: Array | np.ndarray,
+    domain: Any = None,
+    *,
+    method: Any = None,
+    tol_average: Any = None,
+    tol_maximum: Any = None,
+    max_steps: Any = 0,
+    weights: Any = None,
+    start: Any = None,
+    progress: Any = None,
+    throw: Any = False,
+) -> tuple[Unit, Any, Any]:
+    """Unit, weights and first feet of a fit; raises for what `approximate` could not do with these points.
+
+    The `domain` is that of the base surface, once there is one.
+    """
+    check_switch("throw", throw)
+    if method is not None:
+        check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
+    check_steps("max_steps", max_steps)
+    for tolerance in (tol_average, tol_maximum):
+        if tolerance is not None and is_concrete(tolerance):
+            check_number("tol_average and tol_maximum", tolerance, 0.0)
+    if progress is not None and not callable(progress):
+        raise TypeError(
+            f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "
+            "maximum)."
+        )
+    count = points.shape[0]
+    feet = None if start is None else _checked_start(start, count, domain)
+    return unit_of(points), _checked_weights(weights, count), feet
+
+
+def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
+    """One weight for each point, or None."""
+    if weights is None:
+        return None
+    pulls = as_floating("weights", weights, 1)
+    if pulls.shape[0] != count:
+        raise ValueError(
+            f"weights must hold one number for each of the {count} points, but has shape "
+            f"{pulls.shape}; give both the same length."
+        )
+    if is_concrete(pulls) and (np.asarray(pulls).min() < 0 or not np.asarray(pulls).any()):
+        raise ValueError(
+            "weights must not be negative and not all zero; give each point a weight of 0 or more."
+        )
+    return pulls
+
+
+def _checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
+    """One foot for each point, within the domain if that is given."""
+    if not isinstance(start, (tuple, list)) or len(start) != 2:
+        raise ValueError("start must be a pair (u, v) of parameter arrays; pass start=(u, v).")
+    u, v = (as_floating(f"start {name}", x, 1) for name, x in zip("uv", start, strict=True))
+    if u.shape[0] != count or v.shape[0] != count:
+        raise ValueError(
+            f"start must hold a u and a v for each of the {count} points, but their shapes are "
+            f"{u.shape} and {v.shape}; give one pair per point."
+        )
+    for name, x, limits in zip("uv", (u, v), domain or (), strict=False):
+        if not is_concrete(x, limits):
+            continue
+        low, high = (float(y) for y in limits)
+        slack = OUTSIDE * (high - low)
+        if np.asarray(x).min() < low - slack or np.asarray(x).max() > high + slack:
+            raise ValueError(
+                f"start {name} must lie in the domain [{low:g}, {high:g}] of the base surface, but reaches "
+                f"from {np.asarray(x).min():g} to {np.asarray(x).max():g}; give parameters on that surface."
+            )
+    return u, v

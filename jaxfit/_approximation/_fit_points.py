@@ -1,0 +1,90 @@
+"""The verb for scattered points and the curves around them: a base surface, then a fit."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit._approximation._approximate import LEAST_POINTS, approximate
+from jaxfit._approximation._checked_arguments import ApproximationMethod, checked_request
+from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, chosen_base
+from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
+from jaxfit._fit._result import Fit
+
+POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
+MOST_CONTROL_POINTS = 64  # per direction, likewise
+
+
+@eager_where_concrete
+def fit_points(
+    points: ArrayLike,
+    boundary: Boundary | None = None,
+    net: tuple[int, int] | None = None,
+    order: tuple[int, int] = (4, 4),
+    method: ApproximationMethod | None = None,
+    base: Coons | AbstractBaseMethod | None = None,
+    **options: Any,
+) -> Fit:
+    """The whole way from a cloud and its four boundary polylines to a fitted surface.
+
+    Parameters
+    ----------
+    points : array (points, d)
+    boundary : Boundary
+        The four sides of the patch.
+    net : (nu, nv), optional
+        Control points along u and v. Default: about one for every eight points, shared between the
+        directions by the lengths of the sides, at least twice the order and at most 64 each.
+    order : (K, L)
+        Degree + 1 along u and v.
+    base : Coons(), Meshless() or DynamicBaseSurface(), optional
+        How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
+        from the points on average, Meshless(), if it is nearer.
+    method, options
+        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    ValueError
+        As `base_surface` and `approximate` do, and if there is no boundary.
+    TypeError
+        If there is no such option.
+    """
+    _check_names(options)
+    check_order(order)
+    if boundary is None:
+        raise ValueError(
+            "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
+            "four polylines around the patch."
+        )
+    check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
+    cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
+    checked_request(cloud, method=method, **options)
+    net = _default_net(cloud.shape[0], boundary, order) if net is None else net
+    if base is None and is_concrete(cloud):
+        begun = chosen_base(boundary, np.asarray(cloud), net, order)
+    else:
+        begun = base_surface(boundary, cloud, net=net, order=order, method=base)
+    return approximate(cloud, begun, method, **options)
+
+
+def _check_names(options: dict[str, Any]) -> None:
+    known = list(inspect.signature(approximate).parameters)[3:]  # behind points, base and method
+    for name in options:
+        if name not in known:
+            raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(known)}.")
+
+
+def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:
+    sides = (boundary.v0, boundary.v1, boundary.u0, boundary.u1)
+    lengths = [np.linalg.norm(np.diff(np.asarray(x), axis=0), axis=1).sum() for x in sides]
+    ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
+    root = np.sqrt(max(count / POINTS_PER_CONTROL_POINT, 1.0))
+    wanted = (round(root * ratio), round(root / ratio))
+    nu, nv = (int(np.clip(n, 2 * k, MOST_CONTROL_POINTS)) for n, k in zip(wanted, order, strict=True))
+    return nu, nv

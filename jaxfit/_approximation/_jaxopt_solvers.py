@@ -1,0 +1,67 @@
+"""The adapter to `jaxopt`, imported when first used: its drivers for the least-squares problem of a fit."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._approximation._least_squares import AbstractLeastSquares, Posed
+
+
+class JaxoptGaussNewton(AbstractLeastSquares):
+    """`jaxopt.GaussNewton`, matrix-free: CG on products with the Jacobian and its transpose.
+
+    Parameters
+    ----------
+    tolerance : float
+        On the last step, the norm over all control points, in units of the data's extent.
+    max_steps : int
+        Most steps; each gains the accuracy of one CG solve, a factor of about 1e5.
+    """
+
+    tolerance: float = 1e-10
+    max_steps: int = 20
+
+    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+        """As many steps as it takes."""
+        return _minimised("GaussNewton", problem, self.tolerance, self.max_steps)
+
+
+class JaxoptLevenbergMarquardt(AbstractLeastSquares):
+    """`jaxopt.LevenbergMarquardt`, matrix-free: CG on products with the Jacobian and its transpose.
+
+    Parameters
+    ----------
+    tolerance : float
+        On the norm of the gradient, in units of the data's extent.
+    max_steps : int
+        Most steps of damping.
+    """
+
+    tolerance: float = 1e-11
+    max_steps: int = 60
+
+    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+        """As many steps as it takes."""
+        return _minimised("LevenbergMarquardt", problem, self.tolerance, self.max_steps)
+
+
+def _minimised(name: str, problem: Posed, tolerance: float, steps: int) -> tuple[Array, Array]:
+    """Runs jaxopt's driver of this name on the residual as one vector of the control points as one vector."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says at import that it is not maintained
+        import jaxopt
+
+    def residual(vector: Array) -> Array:
+        parts = jax.tree.leaves(problem.residual(vector.reshape(problem.net.shape)))
+        return jnp.concatenate([x.reshape(-1) for x in parts])
+
+    eps = float(jnp.finfo(problem.net.dtype).eps)
+    driver = getattr(jaxopt, name)
+    options = dict(maxiter=steps, tol=max(tolerance, 10 * eps), implicit_diff=False, jit=True, unroll=False)
+    solver = driver(residual, **options)
+    net = solver.run(problem.net.reshape(-1)).params.reshape(problem.net.shape)
+    net = jnp.where(problem.normal.free[:, :, None], net, problem.net)
+    return net, jnp.zeros((), net.dtype)

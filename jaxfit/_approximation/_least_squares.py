@@ -1,0 +1,168 @@
+"""Ways to solve the least-squares problem of a standard fit, as objects: the drivers of `optimistix`.
+
+All minimise the sum of squares of the same residual, [sqrt(w) (A P - Q); sqrt(lambda) L P], and agree to
+rounding. Neither needs a Jacobian of points times control points.
+"""
+
+from abc import abstractmethod
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jax import Array
+from jaxtyping import Bool, Float
+
+from jaxfit._barrier import materialise
+from jaxfit._normal_equations import NormalOperator, Stencil, System, free_points, normal_solver
+
+
+class Posed(eqx.Module):
+    """A system with its normal matrix on the free control points; the others are as in `net`."""
+
+    system: System
+    normal: NormalOperator
+    net: Float[Array, "nu nv d"]
+
+    def residual(self, net: Float[Array, "nu nv d"]) -> Any:
+        """Of a net, whatever it says of control points that are not free."""
+        return self.system.residual(jnp.where(self.normal.free[:, :, None], net, self.net))
+
+
+def posed(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]) -> Posed:
+    """The problem of improving `net`, whose control points `held` stay."""
+
+    def matrix(system: System) -> tuple[Stencil, Array]:
+        stencil = system.stencil()
+        return stencil, free_points(stencil, held)
+
+    stencil, free = materialise(system.root[0, 0] >= 0, matrix, system)
+    return Posed(system, NormalOperator(stencil, free, net.shape[2]), net)
+
+
+class AbstractLeastSquares(eqx.Module):
+    """A way to solve a linear least-squares problem from a net near the solution."""
+
+    @abstractmethod
+    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+        """The net of least squares, and by what share of its diagonal a singular matrix was shifted."""
+
+
+class GaussNewton(AbstractLeastSquares):
+    """`optimistix.GaussNewton` with the structured normal equations as its linear solver (the default).
+
+    The residual is linear, so that one step solves it: moments of the points within cells, one Cholesky
+    factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
+    """
+
+    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+        """One step."""
+        import optimistix as optx
+
+        linear = StructuredSolver(problem)
+        # The residual is linear, so the first step is the solution: nothing is measured to tell whether it is
+        # the last, and it is not evaluated just to be accepted.
+        solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
+        return _freed(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
+
+
+class LevenbergMarquardt(AbstractLeastSquares):
+    """`optimistix.LevenbergMarquardt`, matrix-free: CG on products with the Jacobian and its transpose.
+
+    Knows nothing of the structure, and takes many passes over the points: an independent check, and a way for
+    systems too large for anything else.
+
+    Parameters
+    ----------
+    tolerance : float
+        Relative and absolute, of the control points in units of the data's extent.
+    max_steps : int
+        Most steps of damping.
+    """
+
+    tolerance: float = 1e-10
+    max_steps: int = 60
+
+    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+        """As many steps as it takes."""
+        import optimistix as optx
+
+        eps = float(jnp.finfo(problem.net.dtype).eps)
+        linear = lx.Normal(lx.CG(rtol=10 * eps, atol=10 * eps, max_steps=problem.net.size))
+        tolerance = max(self.tolerance, 10 * eps)
+        solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
+        net = _solution(solver, problem, self.max_steps).value
+        return _freed(problem, net), jnp.zeros((), net.dtype)
+
+
+def _solution(solver: Any, problem: Posed, steps: int) -> Any:
+    import optimistix as optx
+
+    # Of what it is linearised at, the driver stores the arguments instead of a dozen arrays over the points.
+    @partial(jax.checkpoint, prevent_cse=False)
+    def residual(net: Array, problem: Posed) -> Any:
+        return problem.residual(net)
+
+    return optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
+
+
+def _freed(problem: Posed, net: Array) -> Array:
+    """The free control points of `net`, and the others as they were."""
+    return jnp.where(problem.normal.free[:, :, None], net, problem.net)
+
+
+class StructuredSolver(lx.AbstractLinearSolver):
+    """Solves J x = r in the sense of least squares for the Jacobian J of one known problem.
+
+    The matrix J^T J is known as a stencil and factored once, before the driver starts; of the operator that
+    the driver hands over nothing is asked.
+    """
+
+    problem: Posed
+    state: Any
+
+    class Side(eqx.Module):
+        """Which of J and its transpose is solved for."""
+
+        transposed: bool = eqx.field(static=True, default=False)
+
+    def __init__(self, problem: Posed) -> None:
+        self.problem = problem
+        self.state = self._solver.init(problem.normal, {})
+
+    @property
+    def _solver(self) -> Any:
+        return normal_solver(self.problem.normal)
+
+    @property
+    def shift(self) -> Float[Array, ""]:
+        """By what share of its diagonal a singular matrix was shifted."""
+        return getattr(self.state, "shift", jnp.zeros((), self.problem.net.dtype))
+
+    def init(self, operator: Any, options: dict[str, Any]) -> Side:
+        """Nothing is left to do."""
+        return self.Side()
+
+    def compute(self, state: Side, vector: Any, options: dict[str, Any]) -> Any:
+        """(J^T J)^-1 J^T r, or of the transposed problem the least solution, J (J^T J)^-1 r."""
+        problem = self.problem
+        right = vector if state.transposed else problem.system.adjoint(vector)
+        right = jnp.where(problem.normal.free[:, :, None], right, 0.0)
+        net, result, stats = self._solver.compute(self.state, right, options)
+        if state.transposed:
+            net = jax.jvp(problem.residual, (problem.net,), (net,))[1]
+        return net, result, stats
+
+    def transpose(self, state: Side, options: dict[str, Any]) -> Any:
+        """The same factors serve."""
+        return self.Side(not state.transposed), options
+
+    def conj(self, state: Side, options: dict[str, Any]) -> Any:
+        """Everything is real."""
+        return state, options
+
+    def assume_full_rank(self) -> bool:
+        """What is singular is shifted."""
+        return True

@@ -1,0 +1,25 @@
+"""A wall between parts of a computation that XLA may not fuse through."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+
+def materialise(always: Array, function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)`, computed once and stored.
+
+    XLA's CPU compiler copies an expression into each of its uses, which multiplies the work where one
+    large expression has many; an optimisation barrier is dropped before that happens. A branch on a value
+    known only at run time is a wall that stays. `always` is that value: true, but not provably so.
+    """
+    shapes = jax.eval_shape(function, *args)
+
+    def never(*args: Any) -> Any:
+        # Handing on an argument needs no code; zeros would be a kernel each.
+        some = {(x.shape, x.dtype): x for x in jax.tree.leaves(args)}
+        return jax.tree.map(lambda x: some.get((x.shape, x.dtype), jnp.zeros(x.shape, x.dtype)), shapes)
+
+    return lax.cond(always, function, never, *args)

@@ -1,0 +1,115 @@
+"""The verb for grids: a surface through all of them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit._checks import (
+    as_floating,
+    check_kind,
+    check_number,
+    check_order,
+    check_steps,
+    eager_where_concrete,
+    is_concrete,
+)
+from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._interpolation._geometric import GeometricInterpolation
+from jaxfit._interpolation._geometric_fit import geometric_fit
+from jaxfit._interpolation._hermite import NormalInterpolation
+from jaxfit._interpolation._hermite_fit import normal_fit
+from jaxfit._interpolation._standard import StandardInterpolation
+from jaxfit._interpolation._standard_fit import standard_fit
+from jaxfit._precision import working_dtype
+
+InterpolationMethod = GeometricInterpolation | StandardInterpolation | NormalInterpolation
+
+
+@eager_where_concrete
+def interpolate(
+    grid: ArrayLike,
+    method: InterpolationMethod | None = None,
+    order: tuple[int, int] = (4, 4),
+    tolerance: ArrayLike | None = None,
+    max_steps: int = 1000,
+    progress: Callable[[int, int, float, float], None] | None = None,
+    throw: bool = False,
+    normals: ArrayLike | None = None,
+) -> Fit:
+    """A B-spline surface through every point of a grid, with one control point for each.
+
+    With `normals` it has four for each, and the given normals besides.
+
+    Parameters
+    ----------
+    grid : array (n, m, d)
+        Any unit; at least `order` points in each direction.
+    method : GeometricInterpolation or StandardInterpolation, optional
+        Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals.
+    order : (K, L)
+        Degree + 1 along the first and the second index, each 2 to 8.
+    tolerance : float, optional
+        The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
+        1e-12 in float64, 2e-6 in float32, and more where the data is so far from the origin that rounding its
+        coordinates costs more: `fit.stats["tolerance"]`.
+    max_steps : int
+        Most iterations (of `StandardInterpolation`, cycles of GMRES; `NormalInterpolation` has none).
+    progress : callable, optional
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
+        only by `GeometricInterpolation`; the others are done in one go.
+    throw : bool
+        Raise a RuntimeError with the reason instead of returning a fit that has not converged.
+    normals : array (n, m, 3), optional
+        Unit normals of the surface at the points, for `NormalInterpolation`.
+
+    Returns
+    -------
+    Fit
+        `u`, `v` and `errors` have the shape (n, m) of the grid.
+
+    Raises
+    ------
+    ValueError
+        If the grid has the wrong shape, too few points, entries that are not finite, or no extent; or
+        normals do not fit the grid, are no unit vectors, or are given to a method that does not meet them.
+
+    Notes
+    -----
+    Sections 2.2 and 3 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit`, `vmap` and `grad`: the
+    surface and the feet have derivatives in the data, errors have none. On a closed grid (first row equal to
+    the last) the feet stay on their side of the seam. With `symmetry`, fractions are of the diagonal of the
+    data as given. A grid in single precision is fitted in double precision if the session has that.
+    """
+    check_order(order)
+    check_steps("max_steps", max_steps)
+    if tolerance is not None:
+        check_number("tolerance", tolerance, 0.0)
+    data = _checked_grid(grid, order)
+    if method is None:
+        method = GeometricInterpolation() if normals is None else NormalInterpolation()
+    check_kind("method", method, InterpolationMethod, "GeometricInterpolation()")
+    if normals is not None and not isinstance(method, NormalInterpolation):
+        raise ValueError(
+            f"normals cannot be met by {type(method).__name__}; pass method=NormalInterpolation()."
+        )
+    if isinstance(method, NormalInterpolation):
+        fit = normal_fit(method, data, normals, order, tolerance)
+    elif isinstance(method, StandardInterpolation):
+        fit = standard_fit(method, data, order, tolerance, max_steps)
+    else:
+        fit = geometric_fit(method, data, order, tolerance, max_steps, progress)
+    return converged_or_raise(fit) if throw else fit
+
+
+def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
+    data = as_floating("grid", grid, 3)
+    n, m, d = data.shape
+    if n < order[0] or m < order[1] or d < 1:
+        raise ValueError(
+            f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
+            f"shape {data.shape}; give more points or lower the order."
+        )
+    # NumPy's arrays cost no calls of their own.
+    return np.asarray(data) if is_concrete(data) else data.astype(working_dtype())

@@ -1,0 +1,151 @@
+"""Cholesky factors of a stencil, without roots, one row of the net at a time: S = X D X^T.
+
+Numbered row by row the matrix is block-banded: a row of the net is coupled with the K - 1 next ones. Each
+step inverts the nv x nv block D of one row and takes what it leaves off a window of K - 1 rows to come, so
+that nearly all the work is one product of matrices a step, and nothing outside the band is touched.
+
+The blocks are inverted here, by sweeps. A call to LAPACK for each would be no faster, and its threads wait
+for one another so badly where cores are shared that it may be a hundred times slower.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._normal_equations._stencil import Stencil
+
+# Pivots below this share of the diagonal count as zero (with data enough they stay above 1e-5), and this
+# share is then added to it. Solved for are corrections, so the shift does not bias what a few of them come
+# to; a smaller one would let what the data does not determine grow by the inverse of its root.
+LEAST_PIVOT = 1e-8
+SHIFT = 1e-3
+FLOOR = 0.1  # of the greatest diagonal entry: where the own is less, the share is of this
+ROUNDING = (1e3, 1e5)  # the least of either in units of rounding, for single precision
+
+
+class Factors(eqx.Module):
+    """By rows of the net: `inverse[i]` of block D of row i, and `below[i]`, the K - 1 blocks of X after it.
+
+    `shift` is the share of the diagonal that had to be added: 0 unless the matrix is nearly singular.
+    Where `turned`, the directions of the net are exchanged.
+    """
+
+    inverse: Float[Array, "rows n n"]
+    below: Float[Array, "rows m n"]
+    shift: Float[Array, ""]
+    turned: bool = eqx.field(static=True)
+
+
+def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
+    """Factors of the matrix restricted to the free control points, the others having identity rows.
+
+    A matrix that is nearly singular is shifted by a small multiple of its diagonal. Time
+    O(rows (K n)^2 n) and memory O(rows K n^2), n being the shorter side of the net.
+    """
+    turned = free.shape[1] > free.shape[0]
+    if turned:
+        stencil, free = stencil.transposed(), free.T
+    entries = jnp.asarray(stencil.entries)
+    eps = float(jnp.finfo(entries.dtype).eps)
+    smallest, added = max(LEAST_PIVOT, ROUNDING[0] * eps), max(SHIFT, ROUNDING[1] * eps)
+    nu, nv = free.shape
+    reach = (entries.shape[0] - 1) * nv
+
+    def failed(carry: tuple[Any, Array, Array]) -> Array:
+        (_, _, least), _, trials = carry
+        return ~(least > smallest) & (trials < 2)
+
+    def attempt(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+        trials = carry[2]
+        shift = jnp.where(trials == 0, 0.0, added).astype(entries.dtype)
+        return _factors(entries, free, shift), shift, trials + 1
+
+    zero = jnp.zeros((), entries.dtype)
+    blocks = (jnp.zeros((nu, nv, nv), entries.dtype), jnp.zeros((nu, reach, nv), entries.dtype), zero)
+    begin = (blocks, zero, jnp.asarray(0, jnp.int32))
+    (inverse, below, _), shift, _ = lax.while_loop(failed, attempt, begin)
+    return Factors(inverse, below, shift, turned)
+
+
+def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, Array]:
+    """Blocks of the factors, and the least pivot as a share of its diagonal entry."""
+    order, _, nu, nv = entries.shape
+    reach = (order - 1) * nv
+    ahead = jnp.pad(free, ((0, order - 1), (0, 0)))
+    unit = jnp.eye(nv, dtype=entries.dtype)
+    floor = FLOOR * jnp.max(entries[0, 0])
+
+    def step(window: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array, Array]]:
+        number, bands = row
+        mask = lax.dynamic_slice_in_dim(ahead, number, order)
+        column = jnp.where(mask[:, :, None] & mask[0][None, None, :], _blocks(bands), 0.0)
+        added = shift * unit * jnp.maximum(jnp.diagonal(column[0]), floor)[:, None]
+        own = jnp.where(mask[0][:, None], column[0] + added, unit)
+        rest = column[1:].reshape(reach, nv) - jnp.pad(window[nv:, :nv], ((0, nv), (0, 0)))
+        inverse, least = _inverted(own - window[:nv, :nv], jnp.diagonal(own))
+        below = rest @ inverse
+        after = jnp.pad(window[nv:, nv:], ((0, nv), (0, nv)))
+        return after + below @ rest.T, (inverse, below, least)
+
+    rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(2, 0, 1, 3))
+    _, (inverse, below, least) = lax.scan(step, jnp.zeros((reach, reach), entries.dtype), rows)
+    return inverse, below, jnp.min(least)
+
+
+def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Array, Array]:
+    """The inverse of a positive definite matrix by sweeping out one row after the other, and the least pivot
+    as a share of `size`; stable without exchanging rows."""
+    count = block.shape[0]
+    number = jnp.arange(count)
+
+    def sweep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        matrix, least = carry
+        row = lax.dynamic_slice(matrix, (k, 0), (1, count))
+        column = lax.dynamic_slice(matrix, (0, k), (count, 1))
+        pivot = lax.dynamic_slice(row, (0, k), (1, 1))
+        across, along = (number == k)[None, :], (number == k)[:, None]
+        share = jnp.where(along, -1.0, column) * (jnp.where(across, -1.0, row) / pivot)
+        swept = jnp.where(across | along, 0.0, matrix) - share
+        return swept, jnp.minimum(least, pivot[0, 0] / size[k])
+
+    most = jnp.asarray(jnp.inf, block.dtype)
+    swept, least = lax.fori_loop(0, count, sweep, (block, most))
+    return -swept, least
+
+
+def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
+    """Dense symmetric blocks from their bands, `bands[:, b, j]` standing at (j, j + b) and (j + b, j)."""
+    _, order, count = bands.shape
+    number = jnp.arange(count)
+    apart = number[None, :] - number[:, None]
+    total: Any = jnp.where(apart == 0, bands[:, 0, :, None], 0.0)
+    for b in range(1, order):
+        total = jnp.where(apart == b, bands[:, b, :, None], total)
+        total = jnp.where(apart == -b, bands[:, b, None, :], total)
+    return total
+
+
+def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array, "nu nv c"]:
+    """The solution with the factors, forward and backward; control points not free get their right side."""
+    if factors.turned:
+        right = right.transpose(1, 0, 2)
+    reach = factors.below.shape[1]
+    count, channels = right.shape[1:]
+
+    def forward(window: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        below, value = row
+        value = value - window[:count]
+        return jnp.pad(window[count:], ((0, count), (0, 0))) + below @ value, value
+
+    def backward(later: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        inverse, below, value = row
+        value = inverse @ value - below.T @ later
+        return jnp.concatenate([value, later[: reach - count]]), value
+
+    none = jnp.zeros((reach, channels), right.dtype)
+    _, half = lax.scan(forward, none, (factors.below, right))
+    _, whole = lax.scan(backward, none, (factors.inverse, factors.below, half), reverse=True)
+    return whole.transpose(1, 0, 2) if factors.turned else whole

@@ -1,0 +1,112 @@
+r"""The least-squares problem of equation (8): points at given parameters, and a thin plate.
+
+$$F(P) = \sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F_s
+       = \left| \begin{matrix} \sqrt{w} (A P - Q) \\ \sqrt{\lambda} L P \end{matrix} \right|^2 $$
+
+over the free control points; the others stay where they are and go to the right-hand side. Nothing here
+is of the size points times control points.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from jaxfit._barrier import materialise
+from jaxfit._cells import (
+    Rows,
+    evaluate_values,
+    local_coordinates,
+    net_sums,
+    row_coefficients,
+    row_width,
+    rows_of,
+)
+from jaxfit._normal_equations._moments import normal_stencil
+from jaxfit._normal_equations._stencil import Stencil
+from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
+from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+
+SCARCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
+
+Residual = tuple[Float[Array, "d rows width"], Bending]
+
+
+class System(eqx.Module):
+    """Points in rows, with the square roots of their weights (0 for empty slots)."""
+
+    rows: Rows
+    s: Float[Array, "rows width"]
+    t: Float[Array, "rows width"]
+    root: Float[Array, "rows width"]
+    target: Float[Array, "d rows width"]
+    axis_u: Axis
+    axis_v: Axis
+    plate: ThinPlate
+    smoothing: Float[Any, ""]
+
+    def data_stencil(self) -> Stencil:
+        """A^T W A."""
+        return normal_stencil(self.rows, self.s, self.t, self.root**2, self.axis_u, self.axis_v)
+
+    def stencil(self) -> Stencil:
+        """The normal matrix A^T W A + lambda A_fair of (11)."""
+        return self.data_stencil().plus(self.plate.stencil(), self.smoothing)
+
+    def data_residual(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
+        """sqrt(w) (A P - Q)."""
+        pieces = pieces_on(net, self.axis_u, self.axis_v)
+        on_surface = evaluate_values(row_coefficients(pieces, self.rows)[..., None], self.s, self.t)
+        return self.root[None] * (on_surface - self.target)
+
+    def residual(self, net: Float[Array, "nu nv d"]) -> Residual:
+        """Both parts of what is squared and summed."""
+        plate = self.plate.residual(net)
+        root = jnp.sqrt(jnp.asarray(self.smoothing, net.dtype))
+        return self.data_residual(net), (root * plate[0], root * plate[1], root * plate[2])
+
+    def adjoint(self, residual: Residual) -> Float[Array, "nu nv d"]:
+        """The transposed Jacobian times a residual: half the gradient of F, at `residual(net)`."""
+        data, bending = residual
+        # A wall, or each of the many sums would compute the residual for itself.
+        sums = materialise(self.root[0, 0] >= 0, lambda data: self._sums(data), data)
+        return sums + jnp.sqrt(jnp.asarray(self.smoothing, data.dtype)) * self.plate.adjoint(bending)
+
+    def _sums(self, data: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
+        values = self.root[None] * data
+        return net_sums(self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials)
+
+
+def make_system(
+    pieces: Pieces,
+    u: Float[Any, " points"],
+    v: Float[Any, " points"],
+    target: Float[Any, "d points"],
+    weight: Float[Any, " points"],
+    smoothing: Float[Any, ""],
+) -> System:
+    """Points with parameters (u, v) laid out on the cells of `pieces`, whose net does not matter."""
+    width = row_width(u.shape[0], pieces.cells)
+    rows = rows_of(pieces, u, v, width, weight <= 0)
+
+    def laid_out() -> tuple[Array, Array, Array, Array]:
+        spread = rows.spread(jnp.concatenate([jnp.stack([u, v, weight]), target]))
+        s, t = local_coordinates(pieces, rows.cell[:, None], spread[0], spread[1])
+        root = jnp.sqrt(jnp.where(rows.filled, spread[2], 0.0))
+        return s, t, root, spread[3:]
+
+    s, t, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], laid_out)
+    plate = thin_plate(pieces.axis_u, pieces.axis_v)
+    return System(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
+
+
+def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu nv"]:
+    """Control points to solve for: not held, and reached by some point or by smoothing.
+
+    The others keep their value: those that data touches at most with the far end of a basis function when
+    there is no smoothing, and would throw anywhere, and surplus ones behind repeated end knots.
+    """
+    reached = jnp.asarray(stencil.diagonal)
+    return (reached > SCARCE * jnp.max(reached)) & ~jnp.asarray(held)
