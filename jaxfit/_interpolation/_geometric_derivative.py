@@ -14,12 +14,12 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest import as_feet, project
-from jaxfit._fit._measure import FOOT_STEPS, border, side_bounds
-from jaxfit._fit._problem import axes_of_averages
+from jaxfit._fit._border import corners
+from jaxfit._fit._measure import FOOT_STEPS, side_bounds
 from jaxfit._interpolation._collocation_systems import with_derivative
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
 from jaxfit._interpolation._tensor_collocation import Windows
-from jaxfit._splines._pieces import Axis, pieces_on
+from jaxfit._splines._pieces import Axis, make_axis, pieces_on
 
 NOISE = 1e3  # rounding units of the diagonal: a point so close counts as met
 SHORT = 8  # moves: as many are remembered whole rather than made twice
@@ -103,8 +103,9 @@ class _Way:
         self.net = jnp.asarray(setting.data)
         self.shape = (self.net.shape[0], self.net.shape[1])
         self.feet = (jnp.asarray(setting.feet[0]), jnp.asarray(setting.feet[1]))
-        self.axes = axes_of_averages(setting.knots, order)
-        self.held = border(self.shape[0], self.shape[1], corners_only=True)
+        axes = (make_axis(x, k, simple=True) for x, k in zip(setting.knots, order, strict=True))
+        self.axes: tuple[Axis, Axis] = (next(axes), next(axes))
+        self.held = corners(self.shape[0], self.shape[1])
         self.within = side_bounds(self.axes, *self.shape) if method.keep_borders else None
         self.limit = setting.foot_tolerance * setting.diagonal
         self.lowest = jnp.ones((), self.net.dtype)

@@ -12,11 +12,14 @@ import numpy as np
 from jax import Array, lax
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._loop import Carry, Limits, begin, code_of, result_of, run
-from jaxfit._fit._measure import border
-from jaxfit._fit._problem import Problem, Unit, axes_of_averages, unit_of
-from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._result import Fit, history_of
+from jaxfit._fit._border import corners
+from jaxfit._fit._history import public_history, without_counts
+from jaxfit._fit._loop import LoopState, begin, run
+from jaxfit._fit._problem import Problem, Tolerances
+from jaxfit._fit._reasons import RESULTS, code_of, result_of
+from jaxfit._fit._result import Fit
+from jaxfit._fit._scaling import Unit, unit_of
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._geometric import GeometricInterpolation
 from jaxfit._interpolation._geometric_derivative import Found, Setting, followed
 from jaxfit._interpolation._outcome import extent_of, is_flat
@@ -87,20 +90,21 @@ def geometric_fit(
     goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
     setting = _setting(method, inner, start, unit, goal)
     fixed = lax.stop_gradient(setting) if not concrete else setting
-    carry, problem = _iterated(method, order, fixed, max_steps, progress)
-    if symmetry is not None:
-        net = symmetry.symmetrise_points(carry.net)
-        carry = eqx.tree_at(lambda c: c.net, carry, net if concrete else lax.stop_gradient(net))
-    if concrete:
-        return _fit(carry, problem, unit, grid, start.knots, tolerance)
-    measured = carry.measured
+    loop, problem = _iterated(method, order, fixed, max_steps, progress)
+    end = loop.current
+    net, here = end.surface.control_points, end.projection
     n, m, _ = grid.shape
-    found = Found(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
-    found = followed(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
-    carry = eqx.tree_at(lambda c: c.net, carry, found.net)
-    feet = found.u.reshape(-1), found.v.reshape(-1)
-    carry = eqx.tree_at(lambda c: (c.measured.u, c.measured.v), carry, feet)
-    return _fit(carry, problem, unit, grid, start.knots, tolerance)
+    if symmetry is not None:
+        net = symmetry.symmetrise_points(net)
+        net = net if concrete else lax.stop_gradient(net)
+    u, v = here.u, here.v
+    if not concrete:
+        found = Found(net, u.reshape(n, m), v.reshape(n, m))
+        found = followed(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
+        net, u, v = found.net, found.u.reshape(-1), found.v.reshape(-1)
+    end = eqx.tree_at(lambda x: (x.surface.control_points, x.projection.u, x.projection.v), end, (net, u, v))
+    loop = eqx.tree_at(lambda x: x.current, loop, end)
+    return _fit(loop, problem, unit, grid, start.knots, tolerance)
 
 
 def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: Reflection | None) -> None:
@@ -130,34 +134,37 @@ def _iterated(
     setting: Setting,
     max_steps: int,
     progress: Any,
-) -> tuple[Carry, Problem]:
-    axes = axes_of_averages(setting.knots, order)
+) -> tuple[LoopState, Problem]:
     xp: Any = np if is_concrete(setting) else jnp
     target = setting.data.reshape(-1, setting.data.shape[2]).T
-    ones = np.ones(target.shape[1], target.dtype)  # the net fixes the size, so points are not padded
-    lowest = lowest_eigenvalue(axes, setting.averaged) if method.needs_spectrum else None
-    problem = Problem(target, ones, *axes, ones, setting.diagonal, setting.foot_tolerance, lowest)
-    most = xp.asarray(max_steps, np.int32)
-    limits = Limits(xp.full_like(setting.tolerance, np.inf), setting.tolerance, most)
+    # The net fixes the size, so points are not padded.
+    ones, real = np.ones(target.shape[1], target.dtype), np.ones(target.shape[1], bool)
+    far = xp.full_like(setting.tolerance, np.inf)
+    limits = Tolerances(far, setting.tolerance, xp.asarray(max_steps, np.int32))
+    problem = Problem(target, ones, real, setting.diagonal, xp.ones_like(far), limits)
+    surface = WorkingSurface.of(setting.data, *setting.knots, simple=True)
     u, v = (x.reshape(-1) for x in setting.feet)
-    carry = begin(method, setting.data, u, v, max_steps, problem)
-    return run(method, problem, limits, carry, progress if is_concrete(setting) else None), problem
+    loop = begin(method, problem, surface, u, v, max_steps)
+    if method.needs_spectrum:
+        lowest = lowest_eigenvalue(surface.axes, setting.averaged)
+        loop = eqx.tree_at(lambda x: (x.current.state.lowest, x.next.state.lowest), loop, (lowest, lowest))
+    loop, _ = run(method, problem, loop, progress if is_concrete(setting) else None)
+    return loop, problem
 
 
-def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any) -> Fit:
+def _fit(loop: LoopState, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any) -> Fit:
     n, m, _ = grid.shape
-    concrete = is_concrete(carry, grid)
+    concrete = is_concrete(loop, grid)
     xp: Any = np if concrete else jnp
-    measured = jax.tree.map(np.asarray, carry.measured) if concrete else carry.measured
+    here, net = loop.current.projection, xp.asarray(loop.current.surface.control_points)
+    here = jax.tree.map(np.asarray, here) if concrete else here
     # Corners are never moved: they are the data, to the last bit.
-    corners = border(n, m, corners_only=True)[..., None]
-    net = xp.asarray(carry.net)
-    points = xp.where(corners, grid, unit.outward(net)).astype(net.dtype)
-    errors = measured.error / problem.diagonal + lax.stop_gradient(unit.loss(points))
-    missed = (carry.code == code_of(RESULTS.converged)) & (xp.max(errors) > tolerance)
-    code = xp.where(missed, np.int32(code_of(RESULTS.rounded)), carry.code)
-    lost = xp.sum(~measured.found)
-    parts = [measured.u.reshape(n, m), measured.v.reshape(n, m), errors.reshape(n, m)]
+    points = xp.where(corners(n, m)[..., None], grid, unit.outward(net)).astype(net.dtype)
+    errors = here.error / problem.diagonal + lax.stop_gradient(unit.loss(points))
+    missed = (loop.code == code_of(RESULTS.converged)) & (xp.max(errors) > tolerance)
+    code = xp.where(missed, np.int32(code_of(RESULTS.rounded)), loop.code)
+    lost = xp.sum(~here.converged)
+    parts = [here.u.reshape(n, m), here.v.reshape(n, m), errors.reshape(n, m)]
     parts = [*parts, xp.mean(errors), xp.max(errors)]
     if concrete:
         parts = jax.device_put([np.asarray(x, net.dtype) for x in parts])
@@ -168,10 +175,10 @@ def _fit(carry: Carry, problem: Problem, unit: Unit, grid: Any, knots: Pair, tol
         errors=parts[2],
         average_error=parts[3],
         maximum_error=parts[4],
-        history=history_of(carry),
+        history=without_counts(public_history(loop.history, loop.current.step)),
         result=result_of(code),
         stats={
-            "num_steps": carry.step,
+            "num_steps": loop.current.step,
             "diagonal": unit.diagonal,
             "unconverged_feet": lost,
             "tolerance": tolerance,

@@ -8,10 +8,10 @@ import numpy as np
 from jax import lax
 
 from jaxfit._checks import as_floating, is_concrete
-from jaxfit._fit._loop import code_of
-from jaxfit._fit._problem import unit_of
-from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._result import Fit, History
+from jaxfit._fit._history import History
+from jaxfit._fit._reasons import RESULTS, code_of
+from jaxfit._fit._result import Fit
+from jaxfit._fit._scaling import unit_of
 from jaxfit._interpolation._hermite import NormalInterpolation, solved_with_normals
 from jaxfit._interpolation._outcome import check_solved, ending
 from jaxfit._precision import interpolation_tolerance, working_dtype

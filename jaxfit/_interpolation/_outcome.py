@@ -8,8 +8,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._loop import code_of, result_of
-from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._parameters import AbstractParametrisation, grid_parameters
 
 

@@ -11,10 +11,10 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._loop import code_of
-from jaxfit._fit._problem import Outward, unit_of
-from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._result import Fit, History
+from jaxfit._fit._history import History
+from jaxfit._fit._reasons import RESULTS, code_of
+from jaxfit._fit._result import Fit
+from jaxfit._fit._scaling import Outward, unit_of
 from jaxfit._interpolation._collocation_systems import Account
 from jaxfit._interpolation._outcome import check_solved, ending
 from jaxfit._interpolation._standard import StandardInterpolation, solved
