@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float
 from jaxfit._approximation._least_squares import posed
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
-from jaxfit._fit._method import Iterate
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -184,8 +183,6 @@ def _chosen(
 ) -> Float[Array, ""]:
     """Each round solves with the lambda it has found, and corrects the parameters."""
     held, diagonal = method.held(surface), problem.diagonal
-    first = jnp.asarray(True)
-    step = jnp.asarray(0, jnp.int32)
 
     def one(_: Any, carry: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
         net, here, _ = carry
@@ -195,10 +192,9 @@ def _chosen(
         smoothing = rule.best(scaled)
         system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
         net, _ = method.solver(posed(system, held, net))
-        here, _ = method.measure(problem, Iterate(surface.moved_to(net), here, (), step), first)
-        return net, here, smoothing
+        return net, method.project(problem, surface.moved_to(net), here), smoothing
 
     rounds = rule.rounds if method.parameter_correction else 1
     net = surface.control_points
-    start = eqx.tree_at(lambda p: p.exact, projection, first)
+    start = eqx.tree_at(lambda p: p.exact, projection, jnp.asarray(True))
     return lax.fori_loop(0, rounds, one, (net, start, jnp.zeros((), net.dtype)))[2]

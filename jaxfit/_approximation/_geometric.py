@@ -22,7 +22,7 @@ from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -121,10 +121,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             if getattr(self, name) is not None:
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_switches(self, ("foresee", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")

@@ -28,7 +28,7 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -137,10 +137,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_number("damping", self.damping, 0.0)
         if not 0 < self.damping <= 1:
             raise ValueError(

@@ -14,12 +14,12 @@ from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewt
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
+from jaxfit._checks import check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -101,10 +101,7 @@ class StandardApproximation(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_switches(self, ("parameter_correction",))
 
     @property
@@ -142,20 +139,21 @@ class StandardApproximation(AbstractIterativeMethod):
         parameters = projection.u, projection.v
         return make_system(surface.pieces, *parameters, problem.target, weight, smoothing)
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
+    def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
         """New parameters, or the errors at the old ones."""
-        pieces, before = iterate.surface.pieces, iterate.projection
         idle = ~jnp.asarray(problem.real)
         if self.parameter_correction:
-            here = measure_feet(
-                self.foot_method, problem, pieces, before, self.foot_tolerance, idle, borders=False
+            return measure_feet(
+                self.foot_method, problem, surface.pieces, before, self.foot_tolerance, idle, borders=False
             )
-            return here, iterate.state
-        error = values_at(pieces, before.u, before.v) - problem.target
+        error = values_at(surface.pieces, before.u, before.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
         active = jnp.sum(problem.counted, dtype=jnp.int32)
-        here = Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
-        return here, iterate.state
+        return Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
+        """Feet, or the errors at held parameters."""
+        return self.project(problem, iterate.surface, iterate.projection), iterate.state
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new one, always."""

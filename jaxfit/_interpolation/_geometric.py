@@ -14,7 +14,7 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet, side_bounds
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -116,11 +116,11 @@ class GeometricInterpolation(AbstractIterativeMethod):
             ("parametrisation", AbstractParametrisation, "ChordLength()"),
             ("repositioning", AbstractRepositioning, "OptimalRepositioning()"),
             ("acceleration", AbstractAcceleration, "Richardson()"),
-            ("foot_method", AbstractFootMethod, "Newton()"),
             ("symmetry", (Reflection, type(None)), "Reflection()"),
             ("adjoint", AbstractAdjoint, "UnrolledAdjoint()"),
         ):
             check_kind(name, getattr(self, name), kind, example)
+        check_method(self)
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
