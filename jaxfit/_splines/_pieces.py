@@ -197,11 +197,11 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
     each of its factors is a polynomial of degree one in s. Empty spans give finite values that nothing uses.
     """
     concrete, spans = is_concrete(knots, centre, half), centre.shape[0]
-    basis = np.zeros((order, order, spans), knots.dtype)  # r, a, span
+    basis: Any = np.zeros((order, order, spans), knots.dtype)  # r, a, span
     basis[0, 0] = 1.0
     if order > 1:
         # Knots in the coordinate s of the span, whose own ends are -1 and 1 also where it is empty.
-        local = ((windows(knots, np.arange(spans), 2 * order) - centre) / half)[:, None]
+        local = ((windows(knots, np.arange(spans), 2 * order) - centre[None]) / half[None])[:, None]
         local = np.asarray(local) if concrete else local
         xp: Any = np if concrete else jnp
         right = xp.maximum(local[order:], 1.0)
@@ -226,9 +226,9 @@ def _raised(basis: Any, left: Any, right: Any) -> Any:
 def _moved_on(x: Any, axis: int) -> Any:
     """The entries of `x` one place on, behind a zero; the last is dropped."""
     if is_concrete(x):
-        return np.concatenate(
-            [np.zeros_like(x.take([0], axis)), x.take(range(x.shape[axis] - 1), axis)], axis
-        )
+        moved = np.zeros_like(x)
+        moved.swapaxes(0, axis)[1:] = x.swapaxes(0, axis)[:-1]
+        return moved
     return lax.pad(x, np.zeros((), x.dtype), [(int(i == axis), -int(i == axis), 0) for i in range(x.ndim)])
 
 
@@ -253,7 +253,7 @@ def pieces_on(control_points: Float[Numbers, "nu nv d"], axis_u: Axis, axis_v: A
     exact: Any = {} if concrete else {"precision": lax.Precision.HIGHEST}
     rows = (np if concrete else jnp).einsum("ira,rimd->iamd", poly_u, around, **exact)
     # Along v a sum of shifted slices, which XLA fuses: a product of matrices takes twice as long there.
-    along_v = poly_v.transpose(1, 0, 2)[:, :, None, :]
+    along_v = poly_v.transpose(1, 0, 2)[:, None, None, :, None, :]
     both: Any = sum(rows[:, :, r : r + cells_v, :, None] * along_v[r] for r in range(order_v))
     coefficients = both.transpose(0, 2, 3, 1, 4).reshape(cells_u * cells_v, -1, order_u, order_v)
     return Pieces(coefficients, axis_u, axis_v)
