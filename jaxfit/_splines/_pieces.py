@@ -9,7 +9,6 @@ monomials of low degree are well conditioned, so little is lost against the recu
 same with a single cell and order 1 in v.
 """
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -19,11 +18,9 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
-from jaxfit._splines._windows import windows
+from jaxfit._splines._lookup import last_not_above, windows
 
 Numbers = Array | np.ndarray
-
-UNROLLED = 30  # terms of a sum
 
 
 class Axis(eqx.Module):
@@ -85,28 +82,7 @@ class Axis(eqx.Module):
             number = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
             return np.clip(number, *np.asarray(self.ends)).astype(np.int32)
         ends = np.asarray(self.ends) if is_concrete(self.ends) else self.ends
-        return lax.clamp(ends[0], _last_not_above(self.breaks, jnp.asarray(u)), ends[1])
-
-
-def _last_not_above(breaks: Float[Numbers, " breaks"], u: Float[Array, "..."]) -> Int[Array, "..."]:
-    """The last i with breaks[i] <= u, by counting: every so many breaks, then those between.
-
-    Two short sums without memory between compile and run faster than bisection. The first costs least, up to
-    the length that is compiled without a loop.
-    """
-    count = breaks.shape[0]
-    stride = min(math.isqrt(count), -(-count // UNROLLED))
-    first = _count_not_above(breaks[::stride].reshape(-1, *(1,) * u.ndim), u) - 1
-    if stride == 1:
-        return first
-    first = jnp.maximum(first, 0) * stride
-    padded = jnp.concatenate([breaks, np.full(stride, np.inf, breaks.dtype)])
-    return first + _count_not_above(windows(padded, first + 1, stride - 1), u)
-
-
-def _count_not_above(breaks: Float[Numbers, "breaks *rest"], u: Float[Array, "..."]) -> Int[Array, "..."]:
-    """How many of the breaks are at most u, for one set of breaks or for a set of each u."""
-    return lax.reduce((breaks <= u[None]).astype(np.int32), np.int32(0), lax.add, (0,))
+        return lax.clamp(ends[0], last_not_above(self.breaks, jnp.asarray(u)), ends[1])
 
 
 class Pieces(eqx.Module):
