@@ -27,7 +27,9 @@ def in_blocks(kernel: Callable[..., Array], *parameters: Array) -> Array:
     else:
         # Padding repeats the last parameter, so that no extrapolated value can overflow.
         padded = [jnp.pad(x, (0, -count % BLOCK), mode="edge").reshape(-1, BLOCK) for x in flat]
-        blocks = lax.map(lambda each: kernel(*each), tuple(padded))
+        # Derivatives compute a block again: what they would store of all blocks is larger than the cache.
+        again = jax.checkpoint(kernel)
+        blocks = lax.map(lambda each: again(*each), tuple(padded))
         result = blocks.reshape(-1, *blocks.shape[2:])[:count]
     return result.reshape(*shape, *result.shape[1:])
 
