@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._checks import is_concrete
+from jaxfit._checks import check_resolution, is_concrete
 from jaxfit._precision import bucket, working_dtype
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._pieces import Axis, make_axis
@@ -56,7 +56,7 @@ def check_smoothing(smoothing: Any) -> None:
     if not is_concrete(smoothing):
         return
     try:
-        value = np.asarray(smoothing, np.float64)
+        value = np.asarray(np.nan if isinstance(smoothing, (bool, np.bool_)) else smoothing, np.float64)
     except (TypeError, ValueError):
         value = np.asarray(np.nan)
     if value.ndim or not 0 <= value < np.inf:
@@ -163,6 +163,7 @@ def unit_of(points: Any, name: str = "points") -> Unit:
             raise ValueError(
                 f"{name} must not all coincide, but their bounding box has no extent; give distinct points."
             )
+        check_resolution(name, low, high, diagonal)
         info = np.finfo(working_dtype())
         if diagonal < info.tiny / info.eps or max(-low.min(), high.max()) > info.max:
             raise ValueError(

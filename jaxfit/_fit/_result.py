@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit._checks import is_concrete
 from jaxfit._fit._loop import Carry
 from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._summary import describe, describe_briefly
 from jaxfit._splines import BSplineSurface
 
 
@@ -79,6 +80,12 @@ class Fit(eqx.Module):
     history: History
     result: Any
     stats: dict[str, Any]
+
+    def __str__(self) -> str:
+        return describe(self)
+
+    def __repr__(self) -> str:
+        return describe_briefly(self)
 
     @property
     def converged(self) -> Any:
