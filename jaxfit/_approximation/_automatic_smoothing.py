@@ -18,11 +18,11 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._least_squares import posed
+from jaxfit._approximation._least_squares import least_squares_problem
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
 from jaxfit._fit._loop import Limits, Measured
-from jaxfit._normal_equations import BlockCholesky, NormalOperator, System, free_points
+from jaxfit._normal_equations import BlockCholesky, NormalOperator, RegularisedSystem, free_points
 from jaxfit._splines._pieces import pieces_on
 
 DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same trace
@@ -125,7 +125,9 @@ def _check_counts(rule: Any) -> None:
 PROBES = 16
 
 
-def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int) -> Candidates:
+def evaluate_candidates(
+    system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int
+) -> Candidates:
     """All candidates, on the problem of improving `net`; one factorisation for each."""
     data, plate = system.data_stencil(), system.plate.stencil()
     free = free_points(data.plus(plate, 1.0), held)
@@ -135,9 +137,8 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     decades = jnp.asarray(np.linspace(*DECADES, count), net.dtype)
     smoothing = 10.0**decades * traces[0] / jnp.maximum(traces[1], tiny)
     residual = system.data_residual(net)
-    nothing = tuple(0.0 * x for x in system.plate.residual(net))
-    pull = jnp.where(mask, -system.adjoint((residual, (nothing[0], nothing[1], nothing[2]))), 0.0)
-    bend = jnp.where(mask, -plate(net), 0.0)
+    data_rhs = jnp.where(mask, -system.data_adjoint(residual), 0.0)
+    plate_rhs = jnp.where(mask, -plate(net), 0.0)
     signs = np.random.default_rng(0).integers(0, 2, (*net.shape[:2], PROBES)) * 2.0 - 1.0
     probes = jnp.where(mask, jnp.asarray(signs, net.dtype), 0.0)
     d = net.shape[2]
@@ -146,7 +147,7 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     def one(value: Array) -> tuple[Array, Array]:
         operator = NormalOperator(data.plus(plate, value), free, d + PROBES)
         solver = BlockCholesky()
-        right = jnp.concatenate([pull + value * bend, probes], axis=2)
+        right = jnp.concatenate([data_rhs + value * plate_rhs, probes], axis=2)
         solution, _, _ = solver.compute(solver.init(operator, {}), right, {})
         left = system.data_residual(net + solution[:, :, :d])
         across = left if normal is None else jnp.sum(normal * left, axis=0)
@@ -158,7 +159,7 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     return Candidates(smoothing, remaining, effective, points)
 
 
-def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
+def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
     """Unit normals at the points' parameters; 0 where there is none."""
     pieces = pieces_on(net, system.axis_u, system.axis_v)
     jet = evaluate_jet(row_coefficients(pieces, system.rows)[..., None], system.s, system.t)
@@ -168,7 +169,7 @@ def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 ro
 
 
 @partial(jax.jit, static_argnames=("rule", "method"))
-def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> Array:
+def select_smoothing(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> Array:
     """The lambda for a fit that starts from a net and its feet.
 
     Each round solves with the lambda it has found, and corrects the parameters.
@@ -182,11 +183,11 @@ def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> 
     def one(_: Any, carry: tuple[Array, Measured, Array]) -> tuple[Array, Measured, Array]:
         net, measured, _ = carry
         system = method.system(problem, pieces_on(net, problem.axis_u, problem.axis_v), measured)
-        candidates = tried(system, held, net, rule.candidates)
+        candidates = evaluate_candidates(system, held, net, rule.candidates)
         scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
         smoothing = rule.best(scaled)
         system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
-        net, _ = method.solver(posed(system, held, net))
+        net, _ = method.solver(least_squares_problem(system, held, net))
         pieces = pieces_on(net, problem.axis_u, problem.axis_v)
         return net, method.measure(problem, limits, pieces, measured, jnp.asarray(True)), smoothing
 

@@ -1,31 +1,26 @@
 """Orthogonal distance: Gauss-Newton on the true distances, with the feet eliminated."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float
 
-from jaxfit._approximation._damping import Trust, farthest_move, is_plausible, next_damping, within_reach
-from jaxfit._approximation._distance_rows import NormalRows, normal_rows
+from jaxfit._approximation._damping import Trust, farthest_move, is_plausible, next_damping
+from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import Growth, KnotInsertion, check_insertion
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
-from jaxfit._approximation._second_order import second_order_pull
+from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_number, check_switches
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._problem import check_smoothing
-from jaxfit._normal_equations import Stencil, coupled_cg, free_points, preconditioner, thin_plate
-from jaxfit._splines._pieces import Axis, Pieces, pieces_on
-
-RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
-MOST_STEPS = 60  # of conjugate gradients
-LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
+from jaxfit._normal_equations import thin_plate
+from jaxfit._splines._pieces import Pieces, pieces_on
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -175,18 +170,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
         held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
         always = problem.diagonal > 0
         feet = (measured.u, measured.v, weight)
-        rows = materialise(
+        equations = materialise(
             always,
-            lambda net, *x: normal_rows(problem, pieces_on(net, *axes), *x),
+            lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
             *(net, *feet, trust.damping),
         )
 
-        def bends(net: Array, move: Array) -> Array:
+        def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
-            return materialise(always, partial(second_order_pull, problem), pieces, moves, *feet)
+            return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
-        solve = partial(_stepped, axes, problem.smoothing, self.reach, bends)
-        following, foreseen = materialise(always, solve, rows, net, held, trust.damping)
+        solve = partial(gauss_newton_step, axes, problem.smoothing, self.reach, correction_rhs)
+        following, foreseen = materialise(always, solve, equations, net, held, trust.damping)
         trust = eqx.tree_at(lambda t: (t.net, t.foreseen), trust, (net, foreseen))
         return Turn(following, turn.step + 1, turn.records, growth, turn.shift, trust)
 
@@ -206,42 +201,3 @@ class OrthogonalDistance(AbstractIterativeMethod):
 def true_weight(problem: Any) -> Array:
     """Weights of the points, 0 for padding."""
     return jnp.where(problem.padding > 0, problem.weight, 0.0)
-
-
-def _stepped(
-    axes: tuple[Axis, Axis],
-    smoothing: Any,
-    reach: float,
-    bends: Callable[[Array, Array], Array],
-    rows: NormalRows,
-    net: Float[Array, "nu nv d"],
-    held: Bool[Array, "nu nv"],
-    damping: Float[Array, ""],
-) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-    """The net after the step, and by how much the objective should fall."""
-    plate = thin_plate(*axes)
-    stiffness = plate.stencil()
-    matrix = rows.matrix.plus(stiffness, smoothing)
-    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
-    scale = 1.0 + (net.shape[2] - 1) * damping
-    uncoupled = Stencil(rows.matrix.trace.entries / scale).plus(stiffness, smoothing)
-    free = free_points(uncoupled, held)
-    right = rows.gradient - smoothing * plate.adjoint(plate.residual(net))
-    right = jnp.where(free[:, :, None], right, 0.0)
-    near = preconditioner(matrix, uncoupled, free)
-    move = coupled_cg(matrix, right, free, near, RESIDUAL, MOST_STEPS)
-    move = jnp.where(damping < 1, within_reach(net, move, reach), move)
-    foreseen = jnp.sum(move * (2.0 * right - matrix(move)))
-
-    def corrected() -> Array:
-        bent = jnp.where(free[:, :, None], bends(net, move), 0.0)
-        second = coupled_cg(matrix, bent, free, near, RESIDUAL, MOST_STEPS)
-        return within_reach(net, move + _at_most(LARGEST_CORRECTION, second, move), reach)
-
-    return net + lax.cond(damping < 1, corrected, lambda: move), foreseen
-
-
-def _at_most(share: float, correction: Array, move: Array) -> Array:
-    """The correction, no longer than a share of the move."""
-    length, most = jnp.sqrt(jnp.sum(correction**2)), share * jnp.sqrt(jnp.sum(move**2))
-    return jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0) * correction

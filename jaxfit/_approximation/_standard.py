@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool
 
-from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, chosen
+from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select_smoothing
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
-from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, posed
+from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._cells import values_at
 from jaxfit._checks import check_kind, check_switches
@@ -18,7 +18,7 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border_on, measure_feet
 from jaxfit._fit._problem import check_smoothing
-from jaxfit._normal_equations import System, make_system, thin_plate
+from jaxfit._normal_equations import RegularisedSystem, make_system, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces
 
 
@@ -103,7 +103,7 @@ class StandardApproximation(AbstractIterativeMethod):
         """Which control points stay."""
         return border_on(axes, net.shape, corners_only=not self.fixed_boundary)
 
-    def system(self, problem: Any, pieces: Pieces, measured: Measured) -> System:
+    def system(self, problem: Any, pieces: Pieces, measured: Measured) -> RegularisedSystem:
         """The least-squares problem at the present parameters."""
         length = loss_length(self.loss, problem, measured.error)
         weight = reweighted(self.loss, length, problem.weight, measured.error)
@@ -112,7 +112,9 @@ class StandardApproximation(AbstractIterativeMethod):
     def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
         """The net of least squares at the present parameters."""
         held = self.held((pieces.axis_u, pieces.axis_v), turn.net)
-        net, shift = self.solver(posed(self.system(problem, pieces, measured), held, turn.net))
+        net, shift = self.solver(
+            least_squares_problem(self.system(problem, pieces, measured), held, turn.net)
+        )
         before: Any = turn.shift
         step, growth = turn.step + 1, turn.growth
         if self.insertion is not None and growth is not None:
@@ -137,7 +139,7 @@ def with_smoothing(rule: Any, method: StandardApproximation, problem: Any, net: 
     """The problem with the lambda that a rule chooses; as it is where lambda was given as a number."""
     if not isinstance(rule, AbstractSmoothing):
         return problem
-    return eqx.tree_at(lambda p: p.smoothing, problem, chosen(rule, method, problem, net, u, v))
+    return eqx.tree_at(lambda p: p.smoothing, problem, select_smoothing(rule, method, problem, net, u, v))
 
 
 @jax.jit
