@@ -8,9 +8,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, chosen
+from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select_smoothing
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
-from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, posed
+from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._cells import values_at
@@ -23,7 +23,7 @@ from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import System, make_system, thin_plate
+from jaxfit._normal_equations import RegularisedSystem, make_system, thin_plate
 
 
 class StandardState(eqx.Module):
@@ -119,7 +119,7 @@ class StandardApproximation(AbstractIterativeMethod):
     ) -> tuple[WorkingSurface, StandardState]:
         """lambda as given, or chosen from the data."""
         if isinstance(self.smoothing, AbstractSmoothing):
-            smoothing = chosen(self.smoothing, self, problem, surface, projection)
+            smoothing = select_smoothing(self.smoothing, self, problem, surface, projection)
         else:
             smoothing = as_smoothing(self.smoothing, problem.target.dtype)
         xp: Any = np if is_concrete(problem, smoothing) else jnp
@@ -132,7 +132,7 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def system(
         self, problem: Problem, surface: WorkingSurface, projection: Projection, smoothing: Any
-    ) -> System:
+    ) -> RegularisedSystem:
         """The least-squares problem at the present parameters."""
         length = loss_length(self.loss, problem, projection.error)
         weight = reweighted(self.loss, length, problem.weight, projection.error)
@@ -163,7 +163,7 @@ class StandardApproximation(AbstractIterativeMethod):
         """The net of least squares at the present parameters, and new knots."""
         surface, here, state = iterate.surface, iterate.projection, iterate.state
         system = self.system(problem, surface, here, state.smoothing)
-        net, shift = self.solver(posed(system, self.held(surface), surface.control_points))
+        net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
         surface, step = surface.moved_to(net), iterate.step + 1
         if self.insertion is not None:
             surface = self.insertion(step, surface, here, problem.counted)
