@@ -163,15 +163,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
         """Feet from the last accepted ones, and the energy of the surface."""
         surface, state = iterate.surface, iterate.state
-        idle = ~jnp.asarray(problem.real)
         here = measure_feet(
-            self.foot_method,
-            problem,
-            surface.pieces,
-            iterate.projection,
-            self.foot_tolerance,
-            idle,
-            borders=False,
+            self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
         )
         energy = state.smoothing * thin_plate(*surface.axes).energy(surface.control_points)
         return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)

@@ -141,11 +141,9 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
         """New parameters, or the errors at the old ones."""
-        idle = ~jnp.asarray(problem.real)
         if self.parameter_correction:
-            return measure_feet(
-                self.foot_method, problem, surface.pieces, before, self.foot_tolerance, idle, borders=False
-            )
+            return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
+        idle = ~jnp.asarray(problem.real)
         error = values_at(surface.pieces, before.u, before.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
         active = jnp.sum(problem.counted, dtype=jnp.int32)

@@ -13,7 +13,7 @@ from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_feet, side_bounds
+from jaxfit._fit._measure import measure_grid, side_bounds
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -153,14 +153,13 @@ class GeometricInterpolation(AbstractIterativeMethod):
         nu, nv = surface.control_points.shape[:2]
         held = corners(nu, nv).reshape(-1)
         within = side_bounds(surface.axes, nu, nv) if self.keep_borders else None
-        here = measure_feet(
+        here = measure_grid(
             self.foot_method,
             problem,
             surface.pieces,
             iterate.projection,
             self.foot_tolerance,
             held,
-            True,
             within,
         )
         best: GeometricState = iterate.state
