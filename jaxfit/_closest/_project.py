@@ -23,7 +23,7 @@ def initial_feet(
     within: Border | None,
     done: int,
 ) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
-    """Feet at the nearest places to (u, v) in the domain, `idle` ones in the state `done`; and their bounds."""
+    """Feet at the nearest places to (u, v) in the domain, and their bounds; `idle` ones are `done`."""
     low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
     u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
     feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
