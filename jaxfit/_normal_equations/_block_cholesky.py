@@ -107,23 +107,22 @@ def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Arr
     """The inverse of a positive definite matrix by sweeping out one row after the other, and the least pivot
     as a share of `size`; stable without exchanging rows."""
     count = block.shape[0]
-    number, zero = jnp.arange(count, dtype=jnp.int32), np.int32(0)
+    number = jnp.arange(count)
 
-    def cut(array: Array, row: Any, column: Any, size: tuple[int, int]) -> Array:
-        return lax.dynamic_slice(array, (row, column), size, allow_negative_indices=False)
-
-    def sweep(carry: tuple[Array, Array], k: Array) -> tuple[tuple[Array, Array], None]:
+    def sweep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, least = carry
-        row, column = cut(matrix, k, zero, (1, count)), cut(matrix, zero, k, (count, 1))
-        pivot = cut(row, zero, k, (1, 1))
+        zero = np.zeros((), k.dtype)
+        row = lax.dynamic_slice(matrix, (k, zero), (1, count), allow_negative_indices=False)
+        column = lax.dynamic_slice(matrix, (zero, k), (count, 1), allow_negative_indices=False)
+        pivot = lax.dynamic_slice(row, (zero, k), (1, 1), allow_negative_indices=False)
+        own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
         across, along = (number == k)[None, :], (number == k)[:, None]
         share = jnp.where(along, -1.0, column) * (jnp.where(across, -1.0, row) / pivot)
         swept = jnp.where(across | along, 0.0, matrix) - share
-        own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
-        return (swept, jnp.minimum(least, pivot[0] / own)), None
+        return swept, jnp.minimum(least, pivot[0] / own)
 
     most = jnp.full(1, jnp.inf, block.dtype)
-    (swept, least), _ = lax.scan(sweep, (block, most), number)
+    swept, least = lax.fori_loop(0, count, sweep, (block, most))
     return -swept, least
 
 
