@@ -162,7 +162,7 @@ def evaluate_candidates(
 def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
     """Unit normals at the points' parameters; 0 where there is none."""
     pieces = pieces_on(net, system.axis_u, system.axis_v)
-    jet = evaluate_jet(row_coefficients(pieces, system.rows)[..., None], system.s, system.t)
+    jet = evaluate_jet(row_coefficients(pieces, system.rows), system.s, system.t)
     normal = jnp.cross(jet.s, jet.t, axis=0)
     square = jnp.sum(normal**2, axis=0)
     return normal * jnp.where(square > 0, lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)[None]

@@ -90,7 +90,7 @@ def _rows_at(
     """Local coordinates, weighted residuals, and the entries of w (Pi + mu (I - Pi))."""
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    coefficients = row_coefficients(pieces, part)[..., None]
+    coefficients = row_coefficients(pieces, part)
     jet = materialise(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
     e = target - jet.value
     tangential = FreeTangents.at(pieces, u, v, e, jet).entries()

@@ -9,18 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from jaxfit._approximation._control_point_sums import Pulls, pull
+from jaxfit._approximation._control_point_sums import ControlPointSums, WeightedErrors
 from jaxfit._approximation._fairing import Fairing
-from jaxfit._approximation._foot_updates import Follow, Stay
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
 from jaxfit._approximation._local_region import region_of
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Nesterov, at_rest
-from jaxfit._approximation._sums_at_feet import pull_at_feet
 from jaxfit._checks import check_kind, check_number, check_switches
-from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
+from jaxfit._closest import AbstractFootMethod, HuWallner, Newton, FootUpdate, update_feet
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border_on, measure_feet
+from jaxfit._fit._measure import border_on
 from jaxfit._splines._pieces import Pieces
 
 
@@ -178,39 +176,45 @@ class GeometricApproximation(AbstractIterativeMethod):
             before = region_of(pieces, measured.u, measured.v, measured.poor)
             resting = idle | (~before.alive & ~exact)
 
-        def converged(measured: Measured) -> Measured:
-            # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
-            feet = measure_feet(self.foot_method, problem, pieces, measured, resting, borders=False)
-            return eqx.tree_at(lambda m: m.error, feet, jnp.where(resting, measured.error, feet.error))
+        tolerance = problem.foot_tolerance * problem.diagonal
+        single = ~exact if self.foresees else False
+        u, v, ahead = measured.u, measured.v, measured.ahead
+        if ahead is not None:
+            u, v = ahead.predict((pieces.axis_u, pieces.axis_v), u, v)
 
-        here = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
-        if self.loss is not None:  # weights follow from errors, so these come first
-            here = lax.cond(exact, converged, lambda m: m, here) if self.foresees else converged(here)
-        # Where residuals are foreseen in the pass itself, those before it give the scale.
-        weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
+        def looked(u: Array, v: Array, error: Array) -> tuple[Any, WeightedErrors]:
+            weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, error))
+            sums = ControlPointSums(None if self.loss is None else weigh)
+            return update_feet(
+                self.foot_method, pieces, problem.target, u, v, tolerance,
+                idle=resting, single_step=single, sums=sums, weight=problem.weight,
+            )  # fmt: skip
 
-        def at_feet() -> tuple[Measured, Pulls, Array]:
-            return pull_at_feet(self.foot_method, problem, pieces, measured, resting, weigh)
+        if self.loss is None:
+            feet, pulls = looked(u, v, measured.error)
+        else:
+            # Weights follow from errors: those at converged feet, so these are looked at twice, or else
+            # those of the iteration before.
+            none = FootUpdate(u, v, measured.error, measured.steps, measured.found)
+            begin = (jnp.where(exact | (not self.foresees), 0, 1), none, jax.tree.map(jnp.zeros_like, measured.pulls))
 
-        def one_pass() -> tuple[Measured, Pulls, Array]:
-            move = Follow(self.foot_method) if self.foresees else Stay()
-            pulled = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
-            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), pulled.feet)
-            steps = jnp.where(exact, here.steps, 1) if self.foresees else here.steps
-            return Measured(u, v, error, steps, here.found, ahead=measured.ahead), pulled.pulls, pulled.active
+            def look(carry: Any) -> Any:
+                number, feet, _ = carry
+                again, pulls = looked(feet.u, feet.v, feet.error)
+                steps = jnp.where(number > 0, feet.evaluations, again.evaluations)
+                steps = steps if not self.foresees else jnp.where(exact, steps, again.evaluations)
+                return number + 1, eqx.tree_at(lambda f: f.evaluations, again, steps), pulls
 
-        def pulled() -> tuple[Measured, Pulls, Array]:
-            if self.loss is not None:
-                return one_pass()
-            return lax.cond(exact, at_feet, one_pass) if self.foresees else at_feet()
-
-        def still() -> tuple[Measured, Pulls, Array]:
-            feet = converged(here) if self.loss is None else here
-            feet = eqx.tree_at(lambda m: m.ahead, feet, measured.ahead, is_leaf=lambda x: x is None)
-            return feet, jax.tree.map(jnp.zeros_like, measured.pulls), jnp.asarray(0, jnp.int32)
-
-        # Where no move may follow, only feet are asked for.
-        here, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
+            feet, pulls = lax.while_loop(lambda carry: carry[0] < 2, look, begin)[1:]
+        error = jnp.where(resting, measured.error, feet.error)
+        found = feet.converged if single is False else jnp.where(exact, feet.converged, measured.found)
+        if ahead is not None:
+            ahead = ahead.after(jnp.stack([feet.u - measured.u, feet.v - measured.v]))
+        here = Measured(feet.u, feet.v, error, feet.evaluations, found, ahead=ahead)
+        weight = problem.weight
+        if self.loss is not None:
+            weight = reweighted(self.loss, loss_length(self.loss, problem, error), weight, error)
+        active = jnp.sum((weight > 0) & ~resting, dtype=jnp.int32)
         poor = None
         if self.local:
             errors = jnp.where(idle, 0.0, here.error) / problem.diagonal
@@ -218,7 +222,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             # Sums are complete where all points were looked at, or those that feel what was touched before.
             after = region_of(pieces, here.u, here.v, poor)
             touched = jnp.where(exact, after.touched, before.touched)
-            pulls = Pulls(jnp.where(touched[..., None], pulls.sums, 0.0))
+            pulls = WeightedErrors(jnp.where(touched[..., None], pulls.sums, 0.0))
         return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor, here.ahead)
 
 

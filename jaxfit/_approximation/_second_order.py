@@ -71,8 +71,8 @@ def _second_derivative_at(
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     always = u[0, 0] >= pieces.axis_u.breaks[0]
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    jet = materialise(always, evaluate_jet, row_coefficients(pieces, part)[..., None], s, t)
-    coefficients = row_coefficients(moves, part)[..., None]
+    jet = materialise(always, evaluate_jet, row_coefficients(pieces, part), s, t)
+    coefficients = row_coefficients(moves, part)
     value, value_s, value_t = materialise(always, lambda *x: evaluate_jet(*x)[:3], coefficients, s, t)
     e = target - jet.value
     free = FreeTangents.at(pieces, u, v, e, jet)

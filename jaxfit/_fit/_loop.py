@@ -202,9 +202,9 @@ def begin(
 
     `growth` is that of a net with room for more.
     """
-    from jaxfit._approximation._control_point_sums import Pulls
+    from jaxfit._approximation._control_point_sums import WeightedErrors
     from jaxfit._approximation._damping import first_trust
-    from jaxfit._approximation._extrapolation import Ahead
+    from jaxfit._approximation._extrapolation import Extrapolation
     from jaxfit._approximation._nesterov import at_rest
 
     xp: Any = np if is_concrete(net, u, v) else jnp  # NumPy's arrays cost no calls of their own
@@ -215,14 +215,12 @@ def begin(
     if method.counts:
         counts, sizes = xp.zeros(empty.shape, np.int32), xp.zeros((2, *empty.shape), np.int32)
         nothing = number(0)
-    pulls = Pulls(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
+    pulls = WeightedErrors(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
     poor = none > 0 if method.marks else None
     shift = xp.zeros((), net.dtype) if method.solves else None
     ahead = None
     if method.leads:
-        axes = (problem.axis_u, problem.axis_v) if growth is None else growth.axes
-        cells = axes[0].cells * axes[1].cells
-        ahead = Ahead.none(u, cells)
+        ahead = Extrapolation.none(u)
     measured = Measured(u, v, xp.zeros_like(u), none, none > 0, nothing, pulls, poor, ahead)
     trust = first_trust(net, u, v) if method.retreats else None
     momentum = at_rest(net) if method.glides else None

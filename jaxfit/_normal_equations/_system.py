@@ -58,7 +58,7 @@ class RegularisedSystem(eqx.Module):
     def data_residual(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
         """sqrt(w) (A P - Q)."""
         pieces = pieces_on(net, self.axis_u, self.axis_v)
-        on_surface = evaluate_values(row_coefficients(pieces, self.rows)[..., None], self.s, self.t)
+        on_surface = evaluate_values(row_coefficients(pieces, self.rows), self.s, self.t)
         return self.root[None] * (on_surface - self.target)
 
     def residual(self, net: Float[Array, "nu nv d"]) -> Residual:
