@@ -11,8 +11,8 @@ from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border, measure_feet, side_bounds
 from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
 from jaxfit._interpolation._repositioning import AbstractRepositioning, OptimalRepositioning
-from jaxfit._interpolation._tensor_collocation import windows_at
-from jaxfit._interpolation._transposed_solve import AbstractAdjoint, UnrolledAdjoint
+from jaxfit._interpolation._point_collocation import point_collocation
+from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
 from jaxfit._splines._pieces import Pieces
@@ -117,11 +117,11 @@ class GeometricInterpolation(AbstractIterativeMethod):
         nu, nv, _ = turn.net.shape
         target = problem.target.reshape(-1, nu, nv)
         axes = (pieces.axis_u, pieces.axis_v)
-        windows = windows_at(axes, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
+        collocation = point_collocation(axes, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
         held = border(nu, nv, corners_only=True)
         lowest = jnp.ones_like(problem.diagonal) if problem.lowest is None else problem.lowest
-        weight = self.repositioning.weights(windows, lowest)
-        system = System(windows, target, weight, held, lowest, problem.diagonal)
+        weight = self.repositioning.weights(collocation, lowest)
+        system = System(collocation, target, weight, held, lowest, problem.diagonal)
         if self.freeze_after is None:
             most = jnp.ones_like(turn.step)
         else:

@@ -18,10 +18,10 @@ from jaxfit._fit._problem import Problem, Unit, axes_of_averages, unit_of
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, history_of
 from jaxfit._interpolation._geometric import GeometricInterpolation
-from jaxfit._interpolation._geometric_derivative import Found, Setting, followed
+from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
 from jaxfit._interpolation._outcome import extent_of, is_flat
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
-from jaxfit._interpolation._transposed_solve import UnrolledAdjoint
+from jaxfit._interpolation._adjoints import UnrolledAdjoint
 from jaxfit._parameters import grid_parameters
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface, Reflection, averaging_knots
@@ -95,8 +95,8 @@ def geometric_fit(
         return _fit(carry, problem, unit, grid, start.knots, tolerance)
     measured = carry.measured
     n, m, _ = grid.shape
-    found = Found(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
-    found = followed(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
+    found = Fitted(carry.net, measured.u.reshape(n, m), measured.v.reshape(n, m))
+    found = attach_derivative(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
     carry = eqx.tree_at(lambda c: c.net, carry, found.net)
     feet = found.u.reshape(-1), found.v.reshape(-1)
     carry = eqx.tree_at(lambda c: (c.measured.u, c.measured.v), carry, feet)
@@ -116,18 +116,20 @@ def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: R
         grid_parameters(inner, method.parametrisation)
 
 
-def _setting(method: GeometricInterpolation, inner: Any, start: Start, unit: Unit, tolerance: Any) -> Setting:
+def _setting(
+    method: GeometricInterpolation, inner: Any, start: Start, unit: Unit, tolerance: Any
+) -> FitInputs:
     xp: Any = np if is_concrete(inner, tolerance) else jnp
     number = partial(xp.asarray, dtype=inner.dtype)
     diagonal = number(unit.diagonal / unit.scale)
     feet = number(method.foot_tolerance)
-    return Setting(inner, start.knots, start.averaged, start.feet, diagonal, number(tolerance), feet)
+    return FitInputs(inner, start.knots, start.averaged, start.feet, diagonal, number(tolerance), feet)
 
 
 def _iterated(
     method: GeometricInterpolation,
     order: tuple[int, int],
-    setting: Setting,
+    setting: FitInputs,
     max_steps: int,
     progress: Any,
 ) -> tuple[Carry, Problem]:

@@ -6,21 +6,12 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import check_kind, check_number
-from jaxfit._interpolation._collocation_systems import (
-    Account,
-    distances,
-    tensor_collocation,
-    with_derivative,
-)
+from jaxfit._fit._problem import axes_of_averages
+from jaxfit._interpolation._gmres import ErrorHistory, Limits, distances
 from jaxfit._interpolation._outcome import extent_of
-from jaxfit._interpolation._parameter_correction import (
-    Corrected,
-    Task,
-    corrected,
-    errors_at,
-    new_account,
-    settled,
-)
+from jaxfit._interpolation._parameter_correction import CollocationProblem, Corrected, corrected, solved_at
+from jaxfit._interpolation._solution_derivative import with_derivative
+from jaxfit._interpolation._tensor_collocation import tensor_collocation
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import averaging_knots
 
@@ -101,9 +92,7 @@ class Solution(eqx.Module):
     u: Float[Array, "n m"]
     v: Float[Array, "n m"]
     errors: Float[Array, "n m"]
-    account: Account
-    average: Array
-    maximum: Array
+    history: ErrorHistory
     extent: Float[Array, "2"]
     corrections: Array
     parameter_change: Array
@@ -115,7 +104,7 @@ def solved(
     order: tuple[int, int],
     room: int,
     data: Float[Array, "n m d"],
-    limits: tuple[Array, Array, Array],
+    limits: Limits,
 ) -> Solution:
     """The whole fit; `room` is the length of the history."""
     n, m, _ = data.shape
@@ -124,57 +113,36 @@ def solved(
     knots = averaging_knots(averaged[0], order[0]), averaging_knots(averaged[1], order[1])
     tensor = tensor_collocation(knots, order, *averaged)
     net = tensor.solve(data)
-    task = Task(data, knots, tensor, limits)
     if method.per_point:
         u, v = parameters.rows_u, parameters.rows_v
     else:
         u = jnp.broadcast_to(averaged[0][:, None], (n, m))
         v = jnp.broadcast_to(averaged[1][None, :], (n, m))
+    zero, rest = jnp.zeros((), jnp.int32), jnp.zeros((), data.dtype)
     if method.iterative:
-        return _iterated(method, order, room, task, net, u, v)
-    errors = lax.stop_gradient(distances(data - tensor.times(net), limits[0]))
-    zero = jnp.asarray(0, jnp.int32)
-    rest = jnp.zeros((), data.dtype)
-    found = Corrected(net, u, v, new_account(room, errors), zero, rest, zero, jnp.asarray(False))
-    return _solution(task, net, u, v, errors, found)
-
-
-def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: Corrected) -> Solution:
-    account = found.account
+        problem = CollocationProblem(data, axes_of_averages(knots, order), tensor, limits)
+        net, u, v, errors, found = _iterated(method, room, problem, net, u, v)
+    else:
+        errors = lax.stop_gradient(distances(data - tensor.times(net), limits.diagonal))
+        history = ErrorHistory.start(room, errors)
+        found = Corrected(net, u, v, history, zero, rest, zero, jnp.asarray(False))
+    change = jnp.where(found.number > 0, found.change, rest)
     return Solution(
-        net=net,
-        knots=task.knots,
-        u=u,
-        v=v,
-        errors=errors,
-        account=account,
-        average=account.average[account.step],
-        maximum=account.maximum[account.step],
-        extent=extent_of(task.data),
-        corrections=found.number,
-        parameter_change=jnp.where(found.number > 0, found.change, 0.0),
-        lost=found.lost,
+        net, knots, u, v, errors, found.history, extent_of(data), found.number, change, found.lost
     )
 
 
 def _iterated(
-    method: StandardInterpolation,
-    order: tuple[int, int],
-    room: int,
-    task: Task,
-    net: Array,
-    u: Array,
-    v: Array,
-) -> Solution:
+    method: StandardInterpolation, room: int, problem: CollocationProblem, net: Array, u: Array, v: Array
+) -> tuple[Array, Array, Array, Array, Corrected]:
     """The general system, from the net of the tensor product, and corrections of the parameters."""
-    fixed, net, start_u, start_v = lax.stop_gradient((task, net, u, v))
-    errors = errors_at(order, fixed, net, start_u, start_v)
-    found = settled(method, order, fixed, net, start_u, start_v, new_account(room, errors))
+    fixed, net, start_u, start_v = lax.stop_gradient((problem, net, u, v))
+    history = ErrorHistory.start(room, fixed.errors(net, start_u, start_v))
+    found = solved_at(method, fixed, net, start_u, start_v, history)
     if method.parameter_correction:
-        found = corrected(method, order, fixed, found)
+        found = corrected(method, fixed, found)
     found = lax.stop_gradient(found)
     # Derivatives see the first parameters, moved by constants.
     u, v = u + (found.u - start_u), v + (found.v - start_v)
-    net = with_derivative(order, method.restart, found.net, (u, v), task.knots, task.tensor, task.data)
-    errors = errors_at(order, fixed, found.net, found.u, found.v)
-    return _solution(task, net, u, v, errors, found)
+    net = with_derivative(method.restart, found.net, (u, v), problem.axes, problem.tensor, problem.data)
+    return net, u, v, fixed.errors(found.net, found.u, found.v), found

@@ -15,7 +15,7 @@ from jaxfit._fit._loop import code_of
 from jaxfit._fit._problem import Outward, unit_of
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, History
-from jaxfit._interpolation._collocation_systems import Account
+from jaxfit._interpolation._gmres import ErrorHistory, Limits
 from jaxfit._interpolation._outcome import check_solved, ending
 from jaxfit._interpolation._standard import StandardInterpolation, solved
 from jaxfit._precision import bucket, interpolation_tolerance, working_dtype
@@ -76,16 +76,16 @@ def _fitted(
     """The fit, of whose `stats` some come later, and the extent of the grid. To make the fit in here spares
     the host a good part of the time that a small one takes.
     """
-    solution = solved(method, order, room, data, (place.diagonal, place.goal, place.most))
+    solution = solved(method, order, room, data, Limits(place.diagonal, place.goal, place.most))
     net = place.outward(solution.net).at[CORNERS].set(place.corners)  # the data, to the last bit
     loss = lax.stop_gradient(place.outward.loss(net, place.diagonal))
-    account = solution.account
-    maximum = solution.maximum + loss
-    spent = (account.step >= place.most) & method.iterative
+    history = solution.history
+    average, maximum = (x + loss for x in history.last())
+    spent = (history.step >= place.most) & method.iterative
     missed = jnp.where(spent, code_of(RESULTS.max_steps_reached), code_of(RESULTS.stalled))
     met = code_of(RESULTS.converged)
     stats = {
-        "num_steps": account.step,
+        "num_steps": history.step,
         "unconverged_feet": solution.lost,
         "corrections": solution.corrections,
         "parameter_change": solution.parameter_change,
@@ -95,19 +95,19 @@ def _fitted(
         u=solution.u,
         v=solution.v,
         errors=solution.errors + loss,
-        average_error=solution.average + loss,
+        average_error=average,
         maximum_error=maximum,
-        history=_history(account),
+        history=_history(history),
         result=ending(maximum, loss, place.tolerance, met, missed),
         stats=stats,
     )
     return fit, solution.extent
 
 
-def _history(account: Account) -> History:
+def _history(history: ErrorHistory) -> History:
     """The errors; solves evaluate nothing for a foot and move none, and corrections report in `stats`."""
-    none = 0.0 * account.average
-    return History(account.average, account.maximum, none, none)
+    none = 0.0 * history.average
+    return History(history.average, history.maximum, none, none)
 
 
 def _cut(history: History, steps: int) -> History:
