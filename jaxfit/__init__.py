@@ -2,17 +2,20 @@
 
 __version__ = "0.1.0"
 
+from jaxfit._approximation import AtParameters as AtParameters
 from jaxfit._approximation import Discrepancy as Discrepancy
 from jaxfit._approximation import Fairing as Fairing
 from jaxfit._approximation import GaussNewton as GaussNewton
 from jaxfit._approximation import GemanMcClure as GemanMcClure
 from jaxfit._approximation import GeneralizedCrossValidation as GeneralizedCrossValidation
 from jaxfit._approximation import GeometricApproximation as GeometricApproximation
+from jaxfit._approximation import GlobalFeet as GlobalFeet
 from jaxfit._approximation import Huber as Huber
 from jaxfit._approximation import JaxoptGaussNewton as JaxoptGaussNewton
 from jaxfit._approximation import JaxoptLevenbergMarquardt as JaxoptLevenbergMarquardt
 from jaxfit._approximation import KnotInsertion as KnotInsertion
 from jaxfit._approximation import LevenbergMarquardt as LevenbergMarquardt
+from jaxfit._approximation import LocalFeet as LocalFeet
 from jaxfit._approximation import Nesterov as Nesterov
 from jaxfit._approximation import OrthogonalDistance as OrthogonalDistance
 from jaxfit._approximation import StandardApproximation as StandardApproximation
@@ -34,8 +37,18 @@ from jaxfit._closest import Newton as Newton
 from jaxfit._closest import PointStatus as PointStatus
 from jaxfit._closest import closest_point as closest_point
 from jaxfit._fit import RESULTS as RESULTS
+from jaxfit._fit import AbstractIterativeMethod as AbstractIterativeMethod
+from jaxfit._fit import ErrorHistory as ErrorHistory
 from jaxfit._fit import Fit as Fit
+from jaxfit._fit import FixedBorder as FixedBorder
+from jaxfit._fit import FixedCorners as FixedCorners
+from jaxfit._fit import FixedSides as FixedSides
+from jaxfit._fit import FreeBorder as FreeBorder
 from jaxfit._fit import History as History
+from jaxfit._fit import Iterate as Iterate
+from jaxfit._fit import Problem as Problem
+from jaxfit._fit import Projection as Projection
+from jaxfit._fit import WorkingSurface as WorkingSurface
 from jaxfit._interpolation import Chebyshev as Chebyshev
 from jaxfit._interpolation import ConstantWeight as ConstantWeight
 from jaxfit._interpolation import GeometricInterpolation as GeometricInterpolation

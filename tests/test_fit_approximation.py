@@ -60,7 +60,7 @@ def test_one_step_is_algorithm_1(base, weighted):
 
 
 def test_a_free_boundary_moves_all_but_the_corners(base):
-    method = plain(fixed_boundary=False)
+    method = plain(border=jf.FixedCorners())
     fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9)
     shift, _ = one_step(POINTS, base)
     shift[[0, 0, -1, -1], [0, -1, 0, -1]] = 0
@@ -242,7 +242,8 @@ def test_points_of_weight_zero_do_not_pull(base):
     without = jf.approximate(POINTS, base, **options)
     difference = with_it.surface.control_points - without.surface.control_points
     assert np.abs(np.asarray(difference)).max() < 1e-12
-    assert float(with_it.maximum_error) > 0.5
+    assert float(with_it.errors[-1]) > 0.5
+    assert float(with_it.maximum_error) < 0.01  # of the points that count
 
 
 def test_the_order_of_the_points_does_not_matter(base):

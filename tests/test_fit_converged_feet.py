@@ -35,7 +35,7 @@ def fits(base, **options):
         {},
         {"fairing": jf.Fairing(every=5)},
         {"insertion": jf.KnotInsertion(every=6)},
-        {"fixed_boundary": False, "relaxation": 1.7},
+        {"border": jf.FixedCorners(), "relaxation": 1.7},
     ],
     ids=lambda x: "+".join(x) or "plain",
 )

@@ -7,8 +7,8 @@ import pytest
 from helpers import count_compilations, wavy_cloud
 
 import jaxfit as jf
-from jaxfit._approximation._knot_insertion import refined, with_room
-from jaxfit._fit._problem import axes_of
+from jaxfit._approximation._knot_insertion import refined
+from jaxfit._fit._working_surface import WorkingSurface
 
 POINTS, EDGES = wavy_cloud(500, height=0.3)
 GROWING = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=10, most=3), fairing=jf.Fairing())
@@ -45,19 +45,18 @@ def test_errors_are_those_of_the_surface_cut_to_size(fit):
 
 
 def test_the_surface_is_the_same_before_and_after_an_insertion(base):
-    axes = axes_of(base, np.float64)
-    net, growth = with_room(base.control_points, (base.knots_u, base.knots_v), axes, 2)
+    surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v).padded(2)
     u, v = np.random.default_rng(0).random((2, 300))
     error = np.where((u > 0.6) & (v < 0.3), 1.0, 0.01)
     for _ in range(2):
-        net, growth = jax.jit(refined)(net, growth, jnp.asarray(u), jnp.asarray(v), jnp.asarray(error))
-    after = jf.BSplineSurface(net, growth.knots_u, growth.knots_v)
+        surface = jax.jit(refined)(surface, *map(jnp.asarray, (u, v, error)))
+    after = jf.BSplineSurface(surface.control_points, surface.knots_u, surface.knots_v)
     assert np.abs(np.asarray(after(u, v) - base(u, v))).max() < 1e-14
-    added = np.setdiff1d(np.asarray(growth.knots_u), np.asarray(base.knots_u))
+    added = np.setdiff1d(np.asarray(surface.knots_u), np.asarray(base.knots_u))
     assert added.size == 2
     assert (added > 0.5).all()
-    full = jax.jit(refined)(net, growth, jnp.asarray(u), jnp.asarray(v), jnp.asarray(error))[0]
-    assert (np.asarray(full) == np.asarray(net)).all()
+    full = jax.jit(refined)(surface, *map(jnp.asarray, (u, v, error)))
+    assert (np.asarray(full.control_points) == np.asarray(surface.control_points)).all()
 
 
 def test_three_insertions_compile_the_loop_once_and_another_cloud_not_at_all(base, fit):

@@ -10,11 +10,11 @@ from normal_reference import design, thin_plate_matrix
 import jaxfit as jf
 from jaxfit._approximation._automatic_smoothing import Candidates
 from jaxfit._approximation._least_squares import StructuredSolver, posed
-from jaxfit._fit._measure import border
 from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
 
 POINTS, EDGES = wavy_cloud(500)
+EDGE = np.pad(np.zeros((6, 5), bool), 1, constant_values=True)  # of a net of 8 x 7
 BOUNDARY = jf.Boundary(**EDGES)
 SMOOTHING = 1e-3
 
@@ -64,7 +64,7 @@ def test_one_round_is_the_least_squares_fit(base, one):
 
 def test_weights_and_a_free_boundary(base):
     weights = np.random.default_rng(1).uniform(0.1, 3, 500)
-    method = jf.StandardApproximation(smoothing=SMOOTHING, fixed_boundary=False)
+    method = jf.StandardApproximation(smoothing=SMOOTHING, border=jf.FixedCorners())
     fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9, weights=weights)
     assert apart(fit, dense_solution(base, SMOOTHING, True, weights)) < 1e-10
 
@@ -80,7 +80,7 @@ def test_every_driver_finds_the_same_control_points(base, one, solver):
     @jax.jit
     def solved(pieces, net, u, v, points):
         system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
-        return solver(posed(system, border(8, 7, corners_only=False), net))[0]
+        return solver(posed(system, EDGE, net))[0]
 
     net = solved(pieces, base.control_points, feet.u, feet.v, POINTS)
     assert apart(one, np.asarray(net)) < 1e-8
@@ -93,7 +93,7 @@ def test_the_structured_solver_solves_with_the_jacobian_and_with_its_transpose(b
     @jax.jit
     def there_and_back(pieces, net, u, v, points, x):
         system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
-        problem = posed(system, border(8, 7, corners_only=False), net)
+        problem = posed(system, EDGE, net)
         x = jnp.where(problem.normal.free[:, :, None], x, 0.0)
         image = jax.jvp(problem.residual, (net,), (x,))[1]
         solver = StructuredSolver(problem)

@@ -5,6 +5,9 @@ from jaxfit._approximation._automatic_smoothing import Discrepancy as Discrepanc
 from jaxfit._approximation._automatic_smoothing import (
     GeneralizedCrossValidation as GeneralizedCrossValidation,
 )
+from jaxfit._approximation._errors import AtParameters as AtParameters
+from jaxfit._approximation._errors import GlobalFeet as GlobalFeet
+from jaxfit._approximation._errors import LocalFeet as LocalFeet
 from jaxfit._approximation._fairing import Fairing as Fairing
 from jaxfit._approximation._fit_points import fit_points as fit_points
 from jaxfit._approximation._geometric import GeometricApproximation as GeometricApproximation

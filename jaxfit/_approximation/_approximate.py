@@ -1,31 +1,25 @@
 """The verb for scattered points: a surface near all of them, from a base surface."""
 
-from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.typing import ArrayLike
 
-from jaxfit._approximation._checked_arguments import ApproximationMethod, checked_request
+from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._errors import AbstractErrors, Feet, GlobalFeet
 from jaxfit._approximation._geometric import GeometricApproximation
-from jaxfit._approximation._global_feet import global_feet
-from jaxfit._approximation._knot_insertion import cut, with_room
-from jaxfit._approximation._standard import StandardApproximation, bending_energy, with_smoothing
-from jaxfit._checks import (
-    as_points,
-    check_kind,
-    eager_where_concrete,
-    is_concrete,
-)
+from jaxfit._checks import as_points, check_kind, eager_where_concrete, is_concrete
 from jaxfit._closest import closest_point
-from jaxfit._fit._loop import Carry, Limits, begin, code_of, result_of, run
-from jaxfit._fit._problem import Problem, Unit, axes_of, make_problem, order_by_cell, padded_start
-from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._result import Fit, Name, converged_or_raise, history_of
+from jaxfit._fit._history import public_history
+from jaxfit._fit._loop import LoopState, Progress, begin, run
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._problem import Problem, Tolerances, make_problem
+from jaxfit._fit._reasons import result_of
+from jaxfit._fit._result import Fit, Name, converged_or_raise
+from jaxfit._fit._scaling import Unit
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._splines import BSplineSurface
 
@@ -36,14 +30,15 @@ LEAST_POINTS = 4
 def approximate(
     points: ArrayLike,
     base: BSplineSurface,
-    method: ApproximationMethod | None = None,
+    method: AbstractIterativeMethod | None = None,
     tol_average: ArrayLike | None = 6e-4,
     tol_maximum: ArrayLike | None = None,
     max_steps: int = 200,
     weights: ArrayLike | None = None,
     start: Any = None,
-    progress: Callable[[int, int, float, float], None] | None = None,
+    progress: Progress | None = None,
     throw: bool = False,
+    errors: AbstractErrors | None = None,
 ) -> Fit:
     """A surface on the net and the knots of `base` that comes close to a cloud of points.
 
@@ -71,6 +66,9 @@ def approximate(
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
+    errors : GlobalFeet(), LocalFeet() or AtParameters(), optional
+        How certain the errors of the fit are to be (default GlobalFeet(), for every method): at true closest
+        points, at local ones, or at the parameters that the method ended with.
 
     Returns
     -------
@@ -95,7 +93,7 @@ def approximate(
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
     cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
-    unit, pulls, feet = checked_request(
+    unit, weight, feet = checked_request(
         cloud,
         base.domain,
         method=method,
@@ -106,158 +104,151 @@ def approximate(
         start=start,
         progress=progress,
         throw=throw,
+        errors=errors,
     )
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
             advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
-    concrete = is_concrete(cloud, base, pulls, start, tol_average, tol_maximum, method)
-    axes = axes_of(base, dtype)
-    problem = make_problem(cloud, pulls, axes, unit, method.foot_tolerance)
-    rule = method.smoothing if isinstance(method, StandardApproximation) else None
-    if not isinstance(method, GeometricApproximation):
-        method, problem = method.prepared(problem)
-    size = problem.target.shape[1]
-    begun = net = jnp.asarray(unit.inward(base.control_points), dtype)
-    growth = None
-    if method.insertion is not None:
-        knots = base.knots_u.astype(dtype), base.knots_v.astype(dtype)
-        net, growth = with_room(net, knots, axes, method.insertion.room(max_steps))
-    if feet is not None:
-        u, v = feet
-    elif concrete:
-        u, v, _, _ = global_feet(_projector(method), problem, net, growth, cloud.shape[0], max_steps)
-    else:
+    concrete = is_concrete(cloud, base, weight, start, tol_average, tol_maximum, method)
+    tolerances = _tolerances(tol_average, tol_maximum, max_steps)
+    problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
+    begun = _working_surface(base, unit, concrete)
+    if feet is None:
         nearest = closest_point(base, cloud)
-        u, v = nearest.u, nearest.v
-    u, v = (padded_start(x, size, dtype) for x in (u, v))
-    if isinstance(method, StandardApproximation):
-        problem = with_smoothing(rule, method, problem, begun, u, v)
-    limits, wrong = _limits(tol_average, tol_maximum, max_steps, problem)
-    together = order_by_cell(axes, u, v, cloud.shape[0])
-    carry = begin(method, net, u[together], v[together], max_steps, problem, growth)
-    carry = run(method, problem.ordered(together), limits, carry, progress if concrete else None)
-    if wrong is not None:
-        code = jnp.where(wrong, np.int32(code_of(RESULTS.diverged)), carry.code)
-        carry = eqx.tree_at(lambda c: c.code, carry, code)
-    surface = _surface(carry, base, begun, unit)
-    parts = _parts(carry, method, problem, together, cloud.shape[0], max_steps, concrete)
-    if not concrete and _projector(method) is not method:  # feet that have never moved
-        nearest = closest_point(surface, cloud)
-        parts = (nearest.u, nearest.v, nearest.distance / unit.diagonal, nearest.converged)
-    fit = _finished(carry, method, problem, parts, unit, surface, concrete)
+        feet = nearest.u, nearest.v
+    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet)
+    order = _order_by_cell(begun, u, v, cloud.shape[0])
+    loop = begin(method, problem.ordered(order), begun, u[order], v[order], max_steps)
+    loop, stats = run(method, problem.ordered(order), loop, progress if concrete else None)
+    surface = _fitted(loop, base, begun, unit)
+    known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
+    parts = _at_feet(errors, surface, cloud, known, method.finds_feet, concrete)
+    stats = {
+        "method": Name(type(method).__name__),
+        "num_steps": loop.current.step,
+        "diagonal": unit.diagonal,
+        "unconverged_feet": _sum(~parts[3]),
+        **stats,
+    }
+    fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if throw else fit
 
 
-def _limits(tol_average: Any, tol_maximum: Any, max_steps: int, problem: Problem) -> tuple[Limits, Any]:
-    """When to stop: at once if a traced lambda is none. The second value says so: it counts as divergence."""
-    dtype, smoothing = problem.target.dtype, problem.smoothing
-    average, maximum = (jnp.asarray(jnp.inf if x is None else x, dtype) for x in (tol_average, tol_maximum))
-    most = jnp.asarray(max_steps, jnp.int32)
-    if smoothing is None or is_concrete(smoothing):
-        return Limits(average, maximum, most), None
-    wrong = ~(jnp.isfinite(smoothing) & (smoothing >= 0))
-    return Limits(average, maximum, jnp.where(wrong, 0, most)), wrong
+def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:
+    dtype, parts = working_dtype(), []
+    for x in (tol_average, tol_maximum):
+        xp: Any = np if is_concrete(x) else jnp
+        parts.append(xp.asarray(np.inf if x is None else x, dtype))
+    return Tolerances(parts[0], parts[1], np.asarray(max_steps, np.int32))
 
 
-def _surface(carry: Carry, base: BSplineSurface, begun: Array, unit: Unit) -> BSplineSurface:
+def _working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> WorkingSurface:
+    """The base surface in the unit of the problem."""
+    dtype = working_dtype()
+    xp: Any = np if concrete else jnp
+    net = xp.asarray(unit.inward(base.control_points), dtype)
+    knots_u, knots_v = (
+        np.asarray(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (base.knots_u, base.knots_v)
+    )
+    return WorkingSurface.of(net, knots_u, knots_v)
+
+
+def _padded(x: Any, size: int, dtype: Any) -> Any:
+    """Starting parameters, repeated at the end up to the size of the problem."""
+    xp: Any = np if is_concrete(x) else jnp
+    x = xp.asarray(x, dtype)
+    return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])]) if size > x.shape[0] else x
+
+
+def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
+    """An order of points, `count` true ones first, in which those of one cell come together: neighbours in
+    memory are then neighbours on the surface, and laying points out in rows is quicker.
+    """
+    axis_u, axis_v = surface.axes
+    xp: Any = np if is_concrete(surface.axes, u, v) else jnp
+    cells = axis_u.cells * axis_v.cells
+    cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)
+    if u.shape[0] > count:
+        cell = xp.where(np.arange(u.shape[0]) >= count, cells, cell)
+    # Numbers of 16 bits are what NumPy sorts in linear time.
+    return xp.argsort(cell.astype(np.uint16) if cells < 1 << 16 else cell, stable=True)
+
+
+def _fitted(loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit) -> BSplineSurface:
     """The fitted surface in the user's unit; control points that have not moved keep every bit.
 
     Inside transformations a net with room for more keeps its surplus control points.
     """
-    parts: Any = (carry.net, base.knots_u, base.knots_v)
-    if carry.growth is not None:
-        growth, whole = carry.growth, not is_concrete(carry)
-        parts = (carry.net, growth.knots_u, growth.knots_v) if whole else cut(carry.net, growth)
-    net, *knots = parts
+    end = loop.current.surface
+    concrete = is_concrete(end, base)
+    if concrete and end.control_points.shape != begun.control_points.shape:
+        end = end.trimmed()
     dtype = base.control_points.dtype
-    xp: Any = np if is_concrete(net, begun, base.control_points) else jnp  # NumPy compiles nothing
-    moved = xp.asarray(unit.outward(net), dtype)
-    if net.shape == begun.shape:
-        still = xp.asarray(net) == xp.asarray(begun)
+    xp: Any = np if concrete else jnp  # NumPy compiles nothing
+    moved = xp.asarray(unit.outward(end.control_points), dtype)
+    if moved.shape == base.control_points.shape:
+        still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)
         moved = xp.where(still, xp.asarray(base.control_points), moved)
-    return BSplineSurface(moved, *(jnp.asarray(x, dtype) for x in knots))
+    parts = moved, xp.asarray(end.knots_u, dtype), xp.asarray(end.knots_v, dtype)
+    return BSplineSurface(*(jax.device_put(parts) if concrete else parts))
 
 
-def _parts(
-    carry: Carry,
-    method: ApproximationMethod,
-    problem: Problem,
-    order: Any,
-    count: int,
-    max_steps: int,
+def _in_given_order(loop: LoopState, order: Any, count: int, unit: Unit, concrete: bool) -> Feet:
+    """Where the fit ended, in the order of the points and in the user's unit."""
+    here = loop.current.projection
+    xp: Any = np if concrete else jnp
+    back = xp.argsort(order)[:count]
+    u, v, error, converged = (xp.asarray(x)[back] for x in (here.u, here.v, here.error, here.converged))
+    return u, v, error * unit.scale, converged
+
+
+def _at_feet(
+    errors: AbstractErrors | None,
+    surface: BSplineSurface,
+    cloud: Any,
+    known: Feet,
+    at_feet: bool,
     concrete: bool,
-) -> Any:
-    """Feet, errors and whether feet were found.
-
-    Feet were followed locally; where another part of the surface has come nearer, that counts.
-    """
-    measured = carry.measured
-    if concrete:
-        measured = jax.tree.map(np.asarray, measured)
-    parts = (measured.u, measured.v, measured.error / problem.diagonal, measured.found)
-    if not concrete:
-        back = jnp.argsort(order)
-        return tuple(x[back] for x in parts)
-    u, v, distances, found = (np.array(np.asarray(x)[:count]) for x in parts)
-    projector = _projector(method)
-    known = (u, v, distances * float(problem.diagonal), found) if projector is method else None
-    # In the order of the loop, in which neighbours come together.
-    together = problem.ordered(order)
-    best = global_feet(projector, together, carry.net, carry.growth, count, max_steps, known)
-    distance = best[2] / float(problem.diagonal)
-    # A foot that has not converged is still on the surface: the distance is no less for that.
-    nearer = best[3] & (distance <= distances * np.where(found, 1 - 1e-6, 1.0))
-    for old, new in ((u, best[0]), (v, best[1]), (distances, distance), (found, best[3])):
-        old[nearer] = new[nearer]
-    place = np.argsort(order[:count])
-    return tuple(x[place] for x in (u, v, distances, found))
+) -> Feet:
+    """Where the errors are measured."""
+    if not concrete and at_feet:
+        return known
+    return (GlobalFeet() if errors is None else errors).feet(surface, cloud, known, at_feet)
 
 
-def _projector(method: ApproximationMethod) -> ApproximationMethod:
-    """A method whose loop finds feet: the method itself, so that nothing else is compiled, if it does."""
-    if isinstance(method, StandardApproximation) and not method.parameter_correction:
-        return GeometricApproximation(foot_method=method.foot_method, foot_tolerance=method.foot_tolerance)
-    return method
-
-
-def _finished(
-    carry: Carry,
-    method: ApproximationMethod,
+def _fit(
+    loop: LoopState,
     problem: Problem,
-    parts: Any,
+    parts: Feet,
     unit: Unit,
     surface: BSplineSurface,
-    concrete: bool,
+    stats: dict[str, Any],
+    fairing: Any,
 ) -> Fit:
+    """The result, of which the points that count make averages and maxima."""
+    concrete = is_concrete(loop, parts, unit)
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
-    u, v, errors = (jax.device_put(x) if concrete else x for x in parts[:3])
+    u, v, distance, _ = (xp.asarray(x) for x in parts)
+    relative = distance / unit.diagonal
+    counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
+    average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
+    maximum = xp.max(xp.where(counted, relative, 0.0))
+    arrays: Any = (u, v, relative, average, maximum)
+    if concrete:
+        arrays = jax.device_put([np.asarray(x, problem.target.dtype) for x in arrays])
     return Fit(
         surface=surface,
-        u=u,
-        v=v,
-        errors=errors,
-        average_error=jnp.asarray(xp.mean(parts[2])),
-        maximum_error=jnp.asarray(xp.max(parts[2])),
-        history=history_of(carry, method),
-        result=result_of(carry.code),
-        stats={
-            "method": Name(type(method).__name__),
-            "num_steps": carry.step,
-            "diagonal": unit.diagonal,
-            "unconverged_feet": xp.sum(~parts[3]),
-            **_smoothing_stats(carry, problem, unit),
-        },
+        u=arrays[0],
+        v=arrays[1],
+        errors=arrays[2],
+        average_error=arrays[3],
+        maximum_error=arrays[4],
+        history=public_history(loop.history, loop.current.step, fairing),
+        result=result_of(loop.code),
+        stats=stats,
     )
 
 
-def _smoothing_stats(carry: Carry, problem: Problem, unit: Unit) -> dict[str, Any]:
-    """What methods with a thin plate add."""
-    if problem.smoothing is None:
-        return {}
-    axes = (problem.axis_u, problem.axis_v) if carry.growth is None else carry.growth.axes
-    energy = bending_energy(carry.net, *axes)
-    stats = {"smoothing": problem.smoothing, "bending_energy": energy * unit.scale**2}
-    trust = carry.next.trust
-    if trust is None:
-        return stats | {"shift": carry.next.shift}
-    return stats | {"damping": trust.damping, "retreats": trust.retreats}
+def _sum(x: Any) -> Any:
+    xp: Any = np if is_concrete(x) else jnp
+    return xp.sum(xp.asarray(x))

@@ -21,7 +21,10 @@ from jaxtyping import Bool, Float
 from jaxfit._approximation._least_squares import posed
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
-from jaxfit._fit._loop import Limits, Measured
+from jaxfit._fit._method import Iterate
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import BlockCholesky, NormalOperator, System, free_points
 from jaxfit._splines._pieces import pieces_on
 
@@ -167,28 +170,35 @@ def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 ro
     return normal * jnp.where(square > 0, lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)[None]
 
 
+def chosen(
+    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
+) -> Float[Array, ""]:
+    """The lambda for a fit that starts from a surface and its feet."""
+    without = eqx.tree_at(lambda m: m.smoothing, method, 0.0)
+    return _chosen(rule, without, problem, surface, projection)
+
+
 @partial(jax.jit, static_argnames=("rule", "method"))
-def chosen(rule: Any, method: Any, problem: Any, net: Array, u: Any, v: Any) -> Array:
-    """The lambda for a fit that starts from a net and its feet.
+def _chosen(
+    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
+) -> Float[Array, ""]:
+    """Each round solves with the lambda it has found, and corrects the parameters."""
+    held, diagonal = method.held(surface), problem.diagonal
+    first = jnp.asarray(True)
+    step = jnp.asarray(0, jnp.int32)
 
-    Each round solves with the lambda it has found, and corrects the parameters.
-    """
-    none = jnp.zeros(u.shape, jnp.int32)
-    measured = Measured(u, v, jnp.zeros_like(u), none, none > 0, jnp.asarray(0, jnp.int32))
-    held = method.held((problem.axis_u, problem.axis_v), net)
-    diagonal = problem.diagonal
-    limits = Limits(diagonal, diagonal, jnp.asarray(1, jnp.int32))  # nothing stops here
-
-    def one(_: Any, carry: tuple[Array, Measured, Array]) -> tuple[Array, Measured, Array]:
-        net, measured, _ = carry
-        system = method.system(problem, pieces_on(net, problem.axis_u, problem.axis_v), measured)
+    def one(_: Any, carry: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
+        net, here, _ = carry
+        system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
         candidates = tried(system, held, net, rule.candidates)
         scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
         smoothing = rule.best(scaled)
         system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
         net, _ = method.solver(posed(system, held, net))
-        pieces = pieces_on(net, problem.axis_u, problem.axis_v)
-        return net, method.measure(problem, limits, pieces, measured, jnp.asarray(True)), smoothing
+        here, _ = method.measure(problem, Iterate(surface.moved_to(net), here, (), step), first)
+        return net, here, smoothing
 
     rounds = rule.rounds if method.parameter_correction else 1
-    return lax.fori_loop(0, rounds, one, (net, measured, jnp.zeros((), net.dtype)))[2]
+    net = surface.control_points
+    start = eqx.tree_at(lambda p: p.exact, projection, first)
+    return lax.fori_loop(0, rounds, one, (net, start, jnp.zeros((), net.dtype)))[2]

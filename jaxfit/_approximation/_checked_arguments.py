@@ -2,17 +2,15 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from jaxfit._approximation._geometric import GeometricApproximation
-from jaxfit._approximation._orthogonal import OrthogonalDistance
-from jaxfit._approximation._standard import StandardApproximation
+from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
-from jaxfit._fit._problem import Unit, unit_of
-
-ApproximationMethod = GeometricApproximation | OrthogonalDistance | StandardApproximation
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._scaling import Unit, unit_of
 
 OUTSIDE = 1e-4  # of the domain: how far out a foot to start from may be
 
@@ -29,6 +27,7 @@ def checked_request(
     start: Any = None,
     progress: Any = None,
     throw: Any = False,
+    errors: Any = None,
 ) -> tuple[Unit, Any, Any]:
     """Unit, weights and first feet of a fit; raises for what `approximate` could not do with these points.
 
@@ -36,7 +35,9 @@ def checked_request(
     """
     check_switch("throw", throw)
     if method is not None:
-        check_kind("method", method, ApproximationMethod, "GeometricApproximation()")
+        check_kind("method", method, AbstractIterativeMethod, "GeometricApproximation()")
+    if errors is not None:
+        check_kind("errors", errors, AbstractErrors, "GlobalFeet()")
     check_steps("max_steps", max_steps)
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):
@@ -48,7 +49,20 @@ def checked_request(
         )
     count = points.shape[0]
     feet = None if start is None else _checked_start(start, count, domain)
-    return unit_of(points), _checked_weights(weights, count), feet
+    weight = _checked_weights(weights, count)
+    return unit_of(_counted(points, weight)), weight, feet
+
+
+def _counted(points: Any, weight: Any) -> Any:
+    """The points that have influence: the others have none on the unit of the fit either."""
+    if weight is None:
+        return points
+    if is_concrete(points, weight):
+        counted = np.asarray(weight) > 0
+        return points if counted.all() else np.asarray(points)[counted]
+    # Of traced weights all points of weight 0 are taken to be where one that counts is.
+    first = points[jnp.argmax(weight > 0)]
+    return jnp.where((weight > 0)[:, None], points, first[None])
 
 
 def _checked_weights(weights: ArrayLike | None, count: int) -> Any:

@@ -1,4 +1,4 @@
-"""What a method remembers that may have to take a step back: the surface it trusts, and how it damps."""
+"""Damped steps: how a step is judged, and how much the next one is damped."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from jaxfit._checks import is_concrete
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis
 
 # A step that brings less than the one share of the fall its model foresaw is damped more, beyond the other
@@ -22,45 +22,39 @@ EXCELLENT, MUCH, USUAL_DAMPING, LEAST_DAMPING = 0.9, 0.5, 1e-4, 1e-12
 LONGEST_WAY = 4.0  # of a foot, in cells, in a step that brings less than GOOD
 
 
-class Trust(eqx.Module):
-    """The last accepted surface, its feet, and the step from it that is to be judged.
+class DampingState(eqx.Module):
+    """The surface a step began from, and what it is judged by.
 
-    `damping` lies between its least value and 1, where no step can fail. `foreseen` is by how much the
-    objective should fall, `bending` the thin plate's part of it.
+    `damping` lies between its least value and 1, where no step can fail. `energy` is the thin plate's part of
+    the objective, `predicted` by how much the objective should fall.
     """
 
-    net: Float[Any, "nu nv d"]
-    u: Float[Any, " points"]
-    v: Float[Any, " points"]
-    error: Float[Any, " points"]
-    found: Bool[Any, " points"]
-    bending: Float[Any, ""]
-    foreseen: Float[Any, ""]
+    origin: WorkingSurface
+    energy: Float[Any, ""]
+    predicted: Float[Any, ""]
     damping: Float[Any, ""]
-    retreats: Int[Any, ""]
+    rejected_steps: Int[Any, ""]
 
 
-def first_trust(net: Any, u: Any, v: Any) -> Trust:
+def first_damping(surface: WorkingSurface, dtype: Any) -> DampingState:
     """Before anything has been measured."""
-    xp: Any = np if is_concrete(net, u, v) else jnp
-    zero, one = xp.zeros((), net.dtype), xp.ones((), net.dtype)
-    none = xp.zeros(u.shape, bool)
-    return Trust(net, u, v, xp.zeros_like(u), none, zero, zero, one, xp.zeros((), np.int32))
+    zero, one = np.zeros((), dtype), np.ones((), dtype)
+    return DampingState(surface, zero, zero, one, np.zeros((), np.int32))
 
 
-def is_plausible(trust: Trust, gain: Array, way: Array) -> Array:
+def is_plausible(state: DampingState, gain: Array, way: Array) -> Array:
     """Whether a step in which a foot went so far did what it was to do."""
-    return (way < LONGEST_WAY) | (gain > GOOD * trust.foreseen) | (trust.damping >= 1)
+    return (way < LONGEST_WAY) | (gain > GOOD * state.predicted) | (state.damping >= 1)
 
 
-def next_damping(trust: Trust, before: Array, gain: Array, good: Array) -> Array:
-    """The damping of the step to come, by the fall of the objective against the fall foreseen."""
-    superb = (gain > EXCELLENT * trust.foreseen) & (gain > MUCH * before)
-    least = jnp.where(superb, LEAST_DAMPING, jnp.minimum(trust.damping, USUAL_DAMPING))
-    factor = jnp.where(gain > GOOD * trust.foreseen, LOWERED, 1.0)
-    factor = jnp.where(gain < POOR * trust.foreseen, RAISED, factor)
+def next_damping(state: DampingState, before: Array, gain: Array, good: Array) -> Array:
+    """The damping of the step to come, by the fall of the objective against the fall predicted."""
+    superb = (gain > EXCELLENT * state.predicted) & (gain > MUCH * before)
+    least = jnp.where(superb, LEAST_DAMPING, jnp.minimum(state.damping, USUAL_DAMPING))
+    factor = jnp.where(gain > GOOD * state.predicted, LOWERED, 1.0)
+    factor = jnp.where(gain < POOR * state.predicted, RAISED, factor)
     factor = jnp.where(good, factor, TAKEN_BACK)
-    return jnp.clip(trust.damping * factor, least, 1.0).astype(trust.damping.dtype)
+    return jnp.clip(state.damping * factor, least, 1.0).astype(state.damping.dtype)
 
 
 def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Array) -> Float[Array, ""]:
@@ -72,7 +66,7 @@ def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Arra
 
 
 def within_reach(
-    net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"], reach: float
+    net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"], reach: Any
 ) -> Float[Array, "nu nv d"]:
     """Moves cut to a share of the distance to the neighbours, the nearer ones of both directions.
 

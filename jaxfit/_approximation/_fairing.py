@@ -34,7 +34,7 @@ class Fairing(eqx.Module):
 
     def __call__(self, net: Float[Array, "nu nv d"], held: Bool[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
         """The faired net; its border, and what is `held`, stays."""
-        near = math.exp(-self.gamma)
+        near = jnp.exp(-jnp.asarray(self.gamma, net.dtype))
         total = 1.0 + 4.0 * near + 4.0 * near**2
         # The mean is a product of one along each direction.
         rows = net[1:-1] + near * (net[:-2] + net[2:])

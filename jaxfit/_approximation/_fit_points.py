@@ -7,9 +7,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._approximation._approximate import LEAST_POINTS, approximate
-from jaxfit._approximation._checked_arguments import ApproximationMethod, checked_request
+from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, chosen_base
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
+from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
 
 POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
@@ -22,7 +23,7 @@ def fit_points(
     boundary: Boundary | None = None,
     net: tuple[int, int] | None = None,
     order: tuple[int, int] = (4, 4),
-    method: ApproximationMethod | None = None,
+    method: AbstractIterativeMethod | None = None,
     base: Coons | AbstractBaseMethod | None = None,
     **options: Any,
 ) -> Fit:

@@ -70,6 +70,7 @@ class Follow(AbstractFootMove):
     """One step of a method, and the residual foreseen there."""
 
     method: AbstractFootMethod
+    tolerance: Float[Array, ""]
 
     looks: ClassVar[int] = 1
 
@@ -78,8 +79,7 @@ class Follow(AbstractFootMove):
     ) -> Moved:
         """See `follow`."""
         jet = Jet(*map(in_line, _evaluated(jet_along_rows, problem, pieces, part, box, u, v)))
-        tolerance = problem.foot_tolerance * problem.diagonal
-        moved = follow(self.method, target - jet.value, jet, u, v, box, tolerance)
+        moved = follow(self.method, target - jet.value, jet, u, v, box, self.tolerance)
         sure = jnp.ones(u.shape, bool)
         return Moved(*moved, sure, sure)
 
@@ -87,12 +87,13 @@ class Follow(AbstractFootMove):
 class Arrive(AbstractFootMove):
     """All the way, in so far as one evaluation proves it; what it does not prove is left to others."""
 
+    tolerance: Float[Array, ""]
+
     looks: ClassVar[int] = 4
 
     def prepare(self, problem: Any, pieces: Pieces) -> tuple[Float[Array, " cells"], Float[Array, ""]]:
         """Bounds on the third derivatives, and a tolerance that can be reached."""
-        wanted = problem.foot_tolerance * problem.diagonal
-        return third_derivatives(pieces), Limits.of(wanted, problem.diagonal, 0).tolerance
+        return third_derivatives(pieces), Limits.of(self.tolerance, problem.diagonal, 0).tolerance
 
     def __call__(
         self, problem: Any, pieces: Pieces, ready: Any, part: Rows, box: RowBox, target: Any, u: Any, v: Any

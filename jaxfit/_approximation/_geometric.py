@@ -1,27 +1,39 @@
 """Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import Bool, Float
 
 from jaxfit._approximation._control_point_sums import Pulls, pull
 from jaxfit._approximation._fairing import Fairing
 from jaxfit._approximation._foot_updates import Follow, Stay
-from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
+from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._local_region import region_of
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
-from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Nesterov, at_rest
+from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, at_rest
 from jaxfit._approximation._sums_at_feet import pull_at_feet
-from jaxfit._checks import check_kind, check_number, check_switches
+from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border_on, measure_feet
-from jaxfit._splines._pieces import Pieces
+from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._measure import measure_feet
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
+
+
+class GeometricState(eqx.Module):
+    """The sums of Algorithm 1 at the last projection, what accelerates it, and where local mode works."""
+
+    sums: Float[Any, "nu nv c"]
+    momentum: Momentum | None
+    exceeded: Bool[Any, " points"] | None  # points that are, or ever were, too far away
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -37,8 +49,8 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     Parameters
     ----------
-    fixed_boundary : bool
-        Hold the border control points (section 2.3 of the paper); otherwise only the four corners.
+    border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
+        Which control points on the border of the net stay (default all of them, section 2.3 of the paper).
     relaxation : float
         How far control points follow, as a multiple of the mean: 1.3 by default, 1 in the paper. Safe below
         4/3, or 2 without acceleration, since the largest eigenvalue of the iteration with feet held is 1.
@@ -74,7 +86,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         `stall_window` iterations.
     """
 
-    fixed_boundary: bool = True
+    border: AbstractBorder = FixedBorder()
     relaxation: float = 1.3
     acceleration: Nesterov | None = Nesterov()
     foresee: bool = True
@@ -87,9 +99,6 @@ class GeometricApproximation(AbstractIterativeMethod):
     stall_window: int = 40
     stall_gain: float = 2e-3
 
-    counts: ClassVar[bool] = True
-    gathers: ClassVar[bool] = True
-
     @classmethod
     def paper(cls, **changes: Any) -> "GeometricApproximation":
         """Section 4 as printed: plain steps, converged feet, fairing, and new knots.
@@ -101,29 +110,9 @@ class GeometricApproximation(AbstractIterativeMethod):
         return cls(**(steps | feet | dict(insertion=KnotInsertion(), fairing=Fairing()) | changes))
 
     @property
-    def foresees(self) -> bool:
-        """Whether feet between the first surface and the last need not have converged."""
-        return self.foresee
-
-    @property
-    def comparable_since(self) -> int:
+    def stall_since(self) -> int:
         """From the first fairing on: a base surface that has not been faired may be nearer."""
         return 0 if self.fairing is None else self.fairing.every
-
-    @property
-    def glides(self) -> bool:
-        """Whether there is momentum."""
-        return self.acceleration is not None
-
-    @property
-    def leads(self) -> bool:
-        """Whether feet start from where their last move leads them."""
-        return not self.foresee and self.loss is None  # else weights follow from errors, and these come first
-
-    @property
-    def marks(self) -> bool:
-        """Whether points that are too far away are remembered."""
-        return self.local
 
     def __check_init__(self) -> None:
         check_loss(self.loss)
@@ -131,7 +120,12 @@ class GeometricApproximation(AbstractIterativeMethod):
         for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
             if getattr(self, name) is not None:
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
-        check_switches(self, ("fixed_boundary", "foresee", "local"))
+        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
+        check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_number("stall_window", self.stall_window, 1, whole=True)
+        check_number("stall_gain", self.stall_gain, 0.0)
+        check_switches(self, ("foresee", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
         if not 0 < self.relaxation < most:
@@ -145,83 +139,114 @@ class GeometricApproximation(AbstractIterativeMethod):
                 f"the next, but is {self.stall_window}; change one of them."
             )
 
-    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
-        """One step of Algorithm 1, fairing, and new knots."""
-        assert measured.pulls is not None
-        net, growth = turn.net, turn.growth
-        axes = (pieces.axis_u, pieces.axis_v)
-        held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
-        reached = jnp.where(held[..., None], net, net + self.relaxation * measured.pulls.means)
-        step, moved, momentum = turn.step + 1, reached, turn.momentum
-        changes = [x.every for x in (self.fairing, self.insertion) if x is not None]
-        changed = jnp.any(step % np.asarray(changes, np.int32) == 0)
-        if self.acceleration is not None and momentum is not None:
-            beyond, momentum = self.acceleration(momentum, reached, turn.records.has_risen(turn.step))
-            moved = jnp.where(changed, reached, beyond)
-        if self.fairing is not None:
-            outside = border_on(axes, net.shape, corners_only=False)
-            moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved, outside), moved)
-        if self.insertion is not None and growth is not None:
-            moved, growth = self.insertion(step, moved, growth, measured, problem.padding > 0)
-        if momentum is not None:
-            momentum = lax.cond(changed, lambda: at_rest(moved), lambda: momentum)
-        return Turn(moved, step, turn.records, growth, momentum=momentum)
+    @property
+    def finds_feet(self) -> bool:
+        """Always."""
+        return True
 
-    def measure(
-        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
-    ) -> Measured:
-        """Feet from the last ones, converged on the new surface or one step on, and how they pull."""
-        idle = problem.padding <= 0
+    def init(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection
+    ) -> tuple[WorkingSurface, GeometricState]:
+        """At rest, with room for new knots."""
+        surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
+        net = surface.control_points
+        xp: Any = np if is_concrete(net, projection) else jnp
+        sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
+        momentum = None if self.acceleration is None else at_rest(net)
+        return surface, GeometricState(sums, momentum, projection.converged if self.local else None)
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
+        """Feet from the last ones, converged on the new surface or one step on, and the sums there."""
+        state: GeometricState = iterate.state
+        pieces, before = iterate.surface.pieces, iterate.projection
+        idle = ~jnp.asarray(problem.real)
         resting = idle
         if self.local:
-            assert measured.poor is not None
-            before = region_of(pieces, measured.u, measured.v, measured.poor)
-            resting = idle | (~before.alive & ~exact)
+            assert state.exceeded is not None
+            region = region_of(pieces, before.u, before.v, state.exceeded)
+            resting = idle | (~region.alive & ~exact)
 
-        def converged(measured: Measured) -> Measured:
+        def converged(feet: Projection) -> Projection:
             # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
-            feet = measure_feet(self.foot_method, problem, pieces, measured, resting, borders=False)
-            return eqx.tree_at(lambda m: m.error, feet, jnp.where(resting, measured.error, feet.error))
+            new = measure_feet(
+                self.foot_method, problem, pieces, feet, self.foot_tolerance, resting, borders=False
+            )
+            return eqx.tree_at(lambda m: m.error, new, jnp.where(resting, feet.error, new.error))
 
-        here = Measured(measured.u, measured.v, measured.error, measured.steps, measured.found)
+        here = before
         if self.loss is not None:  # weights follow from errors, so these come first
-            here = lax.cond(exact, converged, lambda m: m, here) if self.foresees else converged(here)
+            here = lax.cond(exact, converged, lambda m: m, here) if self.foresee else converged(here)
         # Where residuals are foreseen in the pass itself, those before it give the scale.
         weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
 
-        def at_feet() -> tuple[Measured, Pulls, Array]:
-            return pull_at_feet(self.foot_method, problem, pieces, measured, resting, weigh)
+        def at_feet() -> tuple[Projection, Pulls, Array]:
+            return pull_at_feet(
+                self.foot_method, problem, pieces, before, self.foot_tolerance, resting, weigh
+            )
 
-        def one_pass() -> tuple[Measured, Pulls, Array]:
-            move = Follow(self.foot_method) if self.foresees else Stay()
+        def one_pass() -> tuple[Projection, Pulls, Array]:
+            tolerance = self.foot_tolerance * problem.diagonal
+            move = Follow(self.foot_method, tolerance) if self.foresee else Stay()
             pulled = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
             u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), pulled.feet)
-            steps = jnp.where(exact, here.steps, 1) if self.foresees else here.steps
-            return Measured(u, v, error, steps, here.found, ahead=measured.ahead), pulled.pulls, pulled.active
+            steps = jnp.where(exact, here.evaluations, 1) if self.foresee else here.evaluations
+            feet = Projection(u, v, error, steps, here.converged, pulled.active, jnp.asarray(True))
+            return feet, pulled.pulls, pulled.active
 
-        def pulled() -> tuple[Measured, Pulls, Array]:
-            if self.loss is not None:
-                return one_pass()
-            return lax.cond(exact, at_feet, one_pass) if self.foresees else at_feet()
-
-        def still() -> tuple[Measured, Pulls, Array]:
-            feet = converged(here) if self.loss is None else here
-            feet = eqx.tree_at(lambda m: m.ahead, feet, measured.ahead, is_leaf=lambda x: x is None)
-            return feet, jax.tree.map(jnp.zeros_like, measured.pulls), jnp.asarray(0, jnp.int32)
-
-        # Where no move may follow, only feet are asked for.
-        here, pulls, active = lax.cond(limits.max_steps > 0, pulled, still)
-        poor = None
+        if self.loss is not None:
+            here, pulls, active = one_pass()
+        elif self.foresee:
+            here, pulls, active = lax.cond(exact, at_feet, one_pass)
+        else:
+            here, pulls, active = at_feet()
+        sums, exceeded = pulls.sums, state.exceeded
         if self.local:
-            errors = jnp.where(idle, 0.0, here.error) / problem.diagonal
-            poor = measured.poor | (errors > _threshold(limits, jnp.max(errors)))
+            errors = jnp.where(problem.counted, here.error, 0.0) / problem.diagonal
+            exceeded = exceeded | (errors > _threshold(problem, jnp.max(errors)))
             # Sums are complete where all points were looked at, or those that feel what was touched before.
-            after = region_of(pieces, here.u, here.v, poor)
-            touched = jnp.where(exact, after.touched, before.touched)
-            pulls = Pulls(jnp.where(touched[..., None], pulls.sums, 0.0))
-        return Measured(here.u, here.v, here.error, here.steps, here.found, active, pulls, poor, here.ahead)
+            after = region_of(pieces, here.u, here.v, exceeded)
+            touched = jnp.where(exact, after.touched, region.touched)
+            sums = jnp.where(touched[..., None], sums, 0.0)
+        certain = exact | (not self.foresee)
+        here = eqx.tree_at(lambda p: (p.active, p.exact), here, (active, certain))
+        return here, GeometricState(sums, state.momentum, exceeded)
+
+    def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
+        """The new one, always."""
+        return new
+
+    def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
+        """One step of Algorithm 1, fairing, and new knots."""
+        surface, state, step = iterate.surface, iterate.state, iterate.step + 1
+        net, momentum = surface.control_points, state.momentum
+        held = held_points(self.border, net.shape, surface.used)
+        reached = jnp.where(held[..., None], net, net + self.relaxation * Pulls(state.sums).means)
+        changes = [x.every for x in (self.fairing, self.insertion) if x is not None]
+        changed = jnp.any(step % np.asarray(changes, np.int32) == 0)
+        moved = reached
+        if self.acceleration is not None:
+            beyond, momentum = self.acceleration(momentum, reached, history.has_risen(iterate.step))
+            moved = jnp.where(changed, reached, beyond)
+        if self.fairing is not None:
+            outside = held_points(FixedBorder(), net.shape, surface.used)
+            moved = jnp.where(step % self.fairing.every == 0, self.fairing(moved, outside), moved)
+        surface = surface.moved_to(moved)
+        if self.insertion is not None:
+            surface = self.insertion(step, surface, iterate.projection, problem.counted)
+        if momentum is not None:
+            rest = at_rest(surface.control_points)
+            momentum = lax.cond(changed, lambda: rest, lambda: momentum)
+        state = GeometricState(state.sums, momentum, state.exceeded)
+        return Iterate(surface, iterate.projection, state, step), history
+
+    def postprocess(
+        self, problem: Problem, iterate: Iterate, stopped_early: Array
+    ) -> tuple[Iterate, dict[str, Any]]:
+        """Nothing to add."""
+        return iterate, {}
 
 
-def _threshold(limits: Limits, maximum: Array) -> Array:
-    """The error beyond which a point is poor."""
-    return jnp.where(maximum <= limits.maximum, limits.average, limits.maximum)
+def _threshold(problem: Problem, maximum: Array) -> Array:
+    """The error beyond which a point is too far away."""
+    goal = problem.tolerances
+    return jnp.where(maximum <= goal.maximum, goal.average, goal.maximum)

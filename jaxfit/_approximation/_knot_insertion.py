@@ -11,11 +11,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxfit._checks import check_kind, check_number
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis, make_axis
 
 
@@ -42,19 +43,26 @@ class KnotInsertion(eqx.Module):
         check_number("most", self.most, 0, whole=True)
 
     def __call__(
-        self, step: Array, net: Array, growth: "Growth", measured: Any, real: Any
-    ) -> tuple[Array, "Growth"]:
-        """The net after iteration `step`, refined if it is time; of the points only `real` ones count."""
-        error = jnp.where(real, measured.error, 0.0)
+        self,
+        step: Array,
+        surface: WorkingSurface,
+        projection: Projection,
+        counted: Bool[Array, " points"],
+    ) -> WorkingSurface:
+        """The surface after iteration `step`, refined if it is time; only `counted` points matter."""
+        error = jnp.where(counted, projection.error, 0.0)
         return lax.cond(
             step % self.every == 0,
-            lambda: refined(net, growth, measured.u, measured.v, error),
-            lambda: (net, growth),
+            lambda: refined(surface, projection.u, projection.v, error),
+            lambda: surface,
         )
 
-    def room(self, max_steps: int) -> int:
-        """Control points to be added along either direction at most."""
-        return min(self.most, max_steps // self.every)
+
+def room_for(insertion: KnotInsertion | None, surface: WorkingSurface, max_steps: Any) -> WorkingSurface:
+    """The surface with room for all knots that so many iterations may bring."""
+    if insertion is None:
+        return surface
+    return surface.padded(min(insertion.most, int(max_steps) // insertion.every))
 
 
 def check_insertion(insertion: Any) -> None:
@@ -63,48 +71,12 @@ def check_insertion(insertion: Any) -> None:
         check_kind("insertion", insertion, KnotInsertion, "KnotInsertion()")
 
 
-class Growth(eqx.Module):
-    """The knots of a net with room for more, and what follows from them."""
-
-    knots_u: Float[Any, " knots_u"]
-    knots_v: Float[Any, " knots_v"]
-    axis_u: Axis
-    axis_v: Axis
-
-    @property
-    def axes(self) -> tuple[Axis, Axis]:
-        """Both directions."""
-        return self.axis_u, self.axis_v
-
-
-def with_room(net: Any, knots: tuple[Any, Any], axes: tuple[Axis, Axis], room: int) -> tuple[Any, Growth]:
-    """A net and its knots with `room` surplus control points in each direction."""
-    grown = []
-    for index, (knot, axis) in enumerate(zip(knots, axes, strict=True)):
-        order = axis.polynomials.shape[1]
-        xp: Any = np if isinstance(knot, np.ndarray) else jnp
-        knot = xp.concatenate([knot, xp.repeat(knot[-1:], room)])
-        grown += [(knot, _axis(knot, order, axis.creased or order == 2))]
-        net = jnp.concatenate(
-            [net, jnp.repeat(lax.slice_in_dim(net, -1, None, axis=index), room, index)], index
-        )
-    (knots_u, axis_u), (knots_v, axis_v) = grown
-    return net, Growth(knots_u, knots_v, axis_u, axis_v)
-
-
-def _axis(knots: Any, order: int, creased: bool) -> Axis:
-    """The axis of refined knots: new knots make no creases."""
-    return dataclasses.replace(make_axis(knots, order), creased=creased)
-
-
-def refined(
-    net: Float[Array, "nu nv d"], growth: Growth, u: Array, v: Array, error: Array
-) -> tuple[Float[Array, "nu nv d"], Growth]:
+def refined(surface: WorkingSurface, u: Array, v: Array, error: Array) -> WorkingSurface:
     """A knot more in the worst span of either direction, while there is room."""
-    net, knots_u, axis_u = _refined(net, growth.knots_u, growth.axis_u, u, error)
+    net, knots_u, axis_u = _refined(surface.control_points, surface.knots_u, surface.axis_u, u, error)
     turned = jnp.swapaxes(net, 0, 1)
-    turned, knots_v, axis_v = _refined(turned, growth.knots_v, growth.axis_v, v, error)
-    return jnp.swapaxes(turned, 0, 1), Growth(knots_u, knots_v, axis_u, axis_v)
+    turned, knots_v, axis_v = _refined(turned, surface.knots_v, surface.axis_v, v, error)
+    return WorkingSurface(jnp.swapaxes(turned, 0, 1), knots_u, knots_v, axis_u, axis_v)
 
 
 def _refined(
@@ -127,16 +99,5 @@ def _refined(
     moved = share * net + (1.0 - share) * before
     more = jnp.sort(jnp.append(knots, middle))[:-1]
     net, knots = jnp.where(possible, moved, net), jnp.where(possible, more, knots)
-    return net, knots, _axis(knots, order, axis.creased)
-
-
-def cut(net: Any, growth: Growth) -> tuple[Any, Any, Any]:
-    """Control points and both knot vectors in use, as NumPy arrays (concrete)."""
-    (axis_u, axis_v), (knots_u, knots_v) = growth.axes, (growth.knots_u, growth.knots_v)
-    used = [int(axis.used) for axis in (axis_u, axis_v)]
-    ends = [n + axis.polynomials.shape[1] for n, axis in zip(used, (axis_u, axis_v), strict=True)]
-    return (
-        np.asarray(net)[: used[0], : used[1]],
-        np.asarray(knots_u)[: ends[0]],
-        np.asarray(knots_v)[: ends[1]],
-    )
+    # New knots make no creases.
+    return net, knots, dataclasses.replace(make_axis(knots, order), creased=axis.creased)

@@ -15,6 +15,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._checks import check_kind, check_number
+from jaxfit._fit._problem import Problem
 
 # The scale follows from the distance that this share of the points does not exceed, which is that many
 # standard deviations of residuals that are normally distributed along a normal. A median would stand more
@@ -166,9 +167,9 @@ def check_loss(loss: Any) -> None:
         check_kind("loss", loss, AbstractLoss, "Huber()")
 
 
-def loss_length(loss: AbstractLoss | None, problem: Any, error: Any) -> Any:
+def loss_length(loss: AbstractLoss | None, problem: Problem, error: Any) -> Any:
     """The scale of a loss as a length, from the errors if it has none; None for least squares."""
-    return None if loss is None else loss.length(error, problem.padding > 0, problem.diagonal)
+    return None if loss is None else loss.length(error, problem.counted, problem.diagonal)
 
 
 def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:

@@ -2,30 +2,49 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._damping import Trust, farthest_move, is_plausible, next_damping, within_reach
+from jaxfit._approximation._damping import (
+    DampingState,
+    farthest_move,
+    first_damping,
+    is_plausible,
+    next_damping,
+    within_reach,
+)
 from jaxfit._approximation._distance_rows import NormalRows, normal_rows
-from jaxfit._approximation._knot_insertion import Growth, KnotInsertion, check_insertion
+from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._second_order import second_order_pull
+from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._barrier import materialise
-from jaxfit._checks import check_number, check_switches
+from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border_on, measure_feet
-from jaxfit._fit._problem import check_smoothing
+from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._measure import measure_feet
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import Stencil, coupled_cg, free_points, preconditioner, thin_plate
-from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+from jaxfit._splines._pieces import Axis, pieces_on
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
+
+
+class OrthogonalState(eqx.Module):
+    """lambda, and how steps are damped."""
+
+    smoothing: Float[Any, ""]
+    damping: DampingState
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -64,8 +83,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ----------
     smoothing : float
         lambda (default 5e-6), as for `StandardApproximation`; 0 for none. May be traced.
-    fixed_boundary : bool
-        Hold the border control points (section 2.3 of the paper); otherwise only the four corners.
+    border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
+        Which control points on the border of the net stay (default all of them, section 2.3 of the paper).
     insertion : KnotInsertion(), optional
         New knots every few iterations where the errors are greatest; none by default.
     loss : Huber(), Tukey() or GemanMcClure(), optional
@@ -86,7 +105,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     Notes
     -----
     The fit's `stats` say `smoothing`; `bending_energy`, $F_s$ in the squared unit of the data; `damping`, the
-    last mu; and `retreats`, how many steps were taken back.
+    last mu; and `rejected_steps`, how many were taken back.
 
     Far from the points the feet say little, and like the paper's methods this one may fold a surface whose
     base is too far away, or whose net is too coarse for what it is asked; a base made with the points
@@ -103,7 +122,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     """
 
     smoothing: Any = 5e-6
-    fixed_boundary: bool = True
+    border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
     damping: float = 1e-2
@@ -113,14 +132,15 @@ class OrthogonalDistance(AbstractIterativeMethod):
     stall_window: int = 20
     stall_gain: float = 2e-3
 
-    counts: ClassVar[bool] = True
-    retreats: ClassVar[bool] = True
-
     def __check_init__(self) -> None:
         check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
-        check_switches(self, ("fixed_boundary",))
+        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
+        check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_number("stall_window", self.stall_window, 1, whole=True)
+        check_number("stall_gain", self.stall_gain, 0.0)
         check_number("damping", self.damping, 0.0)
         if not 0 < self.damping <= 1:
             raise ValueError(
@@ -130,88 +150,118 @@ class OrthogonalDistance(AbstractIterativeMethod):
         if self.reach == 0:
             raise ValueError("reach must be greater than 0, but is 0; the default is 0.6.")
 
-    def prepared(self, problem: Any) -> tuple["OrthogonalDistance", Any]:
-        """With lambda moved into the problem, so that another one compiles nothing."""
-        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem.smoothed(self.smoothing)
+    @property
+    def stall_since(self) -> int:
+        """From the first iteration on."""
+        return 0
 
-    def measure(
-        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
-    ) -> Measured:
-        """Feet from the last accepted ones."""
-        idle = problem.padding <= 0
-        feet = measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
-        active = jnp.sum(problem.weight > 0, dtype=jnp.int32)
-        return eqx.tree_at(lambda m: m.active, feet, active, is_leaf=lambda x: x is None)
+    @property
+    def finds_feet(self) -> bool:
+        """Always."""
+        return True
 
-    def settle(self, problem: Any, turn: Turn, measured: Measured) -> tuple[Turn, Measured]:
+    def init(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection
+    ) -> tuple[WorkingSurface, OrthogonalState]:
+        """Undamped steps cannot fail, so the first is one."""
+        surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
+        dtype = problem.target.dtype
+        return surface, OrthogonalState(as_smoothing(self.smoothing, dtype), first_damping(surface, dtype))
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
+        """Feet from the last accepted ones, and the energy of the surface."""
+        surface, state = iterate.surface, iterate.state
+        idle = ~jnp.asarray(problem.real)
+        here = measure_feet(
+            self.foot_method,
+            problem,
+            surface.pieces,
+            iterate.projection,
+            self.foot_tolerance,
+            idle,
+            borders=False,
+        )
+        energy = state.smoothing * thin_plate(*surface.axes).energy(surface.control_points)
+        return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
+
+    def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The surface just measured if its objective is lower, or the one before."""
-        trust: Any = turn.trust
-        first = turn.step == 0
-        axes, weight = turn.axes(problem), true_weight(problem)
-        bending = problem.smoothing * thin_plate(*axes).energy(turn.net)
+        state: DampingState = new.state.damping
+        here, before = new.projection, old.projection
+        weight = problem.weight
         # Both surfaces are judged by one scale of the loss.
-        length = loss_length(self.loss, problem, jnp.where(first, measured.error, trust.error))
-        before = total_cost(self.loss, length, weight, trust.error) + trust.bending
-        gain = before - total_cost(self.loss, length, weight, measured.error) - bending
-        way = farthest_move(axes, (trust.u, trust.v), (measured.u, measured.v), weight > 0)
-        good = first | ((gain > 0) & is_plausible(trust, gain, way))
-        damping = jnp.where(turn.step == 1, self.damping, next_damping(trust, before, gain, good))
-        damping = jnp.where(first, trust.damping, damping)
-        here = (turn.net, measured.u, measured.v, measured.error, measured.found, bending)
-        kept = (trust.net, trust.u, trust.v, trust.error, trust.found, trust.bending)
-        net, u, v, error, found, bending = lax.cond(good, lambda: here, lambda: kept)
-        retreats = trust.retreats + ~good
-        trust = Trust(net, u, v, error, found, bending, trust.foreseen, damping, retreats)
-        measured = Measured(u, v, error, measured.steps, found, measured.active)
-        return Turn(net, turn.step, turn.records, turn.growth, turn.shift, trust), measured
+        length = loss_length(self.loss, problem, before.error)
+        worth = total_cost(self.loss, length, weight, before.error) + old.state.damping.energy
+        gain = worth - total_cost(self.loss, length, weight, here.error) - state.energy
+        ways = (before.u, before.v), (here.u, here.v)
+        way = farthest_move(new.surface.axes, *ways, problem.counted)
+        good = (gain > 0) & is_plausible(state, gain, way)
+        damping = jnp.where(new.step == 1, self.damping, next_damping(state, worth, gain, good))
+        origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
+        kept = lax.cond(
+            good,
+            lambda: (new.surface, here, state.energy),
+            lambda: (origin.surface, before, old.state.damping.energy),
+        )
+        surface, projection, energy = kept
+        projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
+        rejected = state.rejected_steps + ~good
+        judged = DampingState(surface, energy, state.predicted, damping, rejected)
+        return Iterate(surface, projection, OrthogonalState(new.state.smoothing, judged), new.step)
 
-    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
+    def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """New knots, and a step to be judged once it has been measured."""
-        trust: Any = turn.trust
-        net, growth = self._refined(problem, measured, turn)
-        axes = turn.axes(problem) if growth is None else growth.axes
-        length = loss_length(self.loss, problem, measured.error)
-        weight = reweighted(self.loss, length, true_weight(problem), measured.error)
-        held = border_on(axes, net.shape, corners_only=not self.fixed_boundary)
+        here, damping = iterate.projection, iterate.state.damping
+        surface = self._refined(problem, iterate)
+        net, axes = surface.control_points, surface.axes
+        length = loss_length(self.loss, problem, here.error)
+        weight = reweighted(self.loss, length, problem.weight, here.error)
+        held = held_points(self.border, net.shape, surface.used)
         always = problem.diagonal > 0
-        feet = (measured.u, measured.v, weight)
+        feet = (here.u, here.v, weight)
         rows = materialise(
             always,
             lambda net, *x: normal_rows(problem, pieces_on(net, *axes), *x),
-            *(net, *feet, trust.damping),
+            *(net, *feet, damping.damping),
         )
 
         def bends(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
             return materialise(always, partial(second_order_pull, problem), pieces, moves, *feet)
 
-        solve = partial(_stepped, axes, problem.smoothing, self.reach, bends)
-        following, foreseen = materialise(always, solve, rows, net, held, trust.damping)
-        trust = eqx.tree_at(lambda t: (t.net, t.foreseen), trust, (net, foreseen))
-        return Turn(following, turn.step + 1, turn.records, growth, turn.shift, trust)
+        solve = partial(_stepped, axes, iterate.state.smoothing, self.reach, bends)
+        following, predicted = materialise(always, solve, rows, net, held, damping.damping)
+        judged = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
+        state = OrthogonalState(iterate.state.smoothing, judged)
+        return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
-    def _refined(self, problem: Any, measured: Measured, turn: Turn) -> tuple[Array, Growth | None]:
-        """The accepted net with new knots if it is time: the surface, and so its feet, are the same."""
-        net, growth = turn.net, turn.growth
-        if self.insertion is None or growth is None:
-            return net, growth
+    def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
+        """The accepted surface with new knots if it is time: it is the same surface, and so are its feet."""
+        if self.insertion is None:
+            return iterate.surface
+        refine = partial(self.insertion, projection=iterate.projection, counted=problem.counted)
         return lax.cond(
-            turn.step > 0,
-            partial(self.insertion, turn.step, measured=measured, real=problem.padding > 0),
-            lambda net, growth: (net, growth),
-            *(net, growth),
+            iterate.step > 0, lambda: refine(iterate.step, iterate.surface), lambda: iterate.surface
         )
 
-
-def true_weight(problem: Any) -> Array:
-    """Weights of the points, 0 for padding."""
-    return jnp.where(problem.padding > 0, problem.weight, 0.0)
+    def postprocess(
+        self, problem: Problem, iterate: Iterate, stopped_early: Array
+    ) -> tuple[Iterate, dict[str, Any]]:
+        """lambda, the integral (10), and how the steps went."""
+        state, surface = iterate.state, iterate.surface
+        energy = thin_plate(*surface.axes).energy(surface.control_points)
+        return iterate, {
+            "smoothing": state.smoothing,
+            "bending_energy": energy * problem.scale**2,
+            "damping": state.damping.damping,
+            "rejected_steps": state.damping.rejected_steps,
+        }
 
 
 def _stepped(
     axes: tuple[Axis, Axis],
     smoothing: Any,
-    reach: float,
+    reach: Any,
     bends: Callable[[Array, Array], Array],
     rows: NormalRows,
     net: Float[Array, "nu nv d"],

@@ -1,25 +1,36 @@
 """Standard approximation of scattered points: section 2.3 of the paper, equations (8) to (11)."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, chosen
-from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
+from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, posed
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
+from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, check_switches
+from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border_on, measure_feet
-from jaxfit._fit._problem import check_smoothing
+from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._measure import measure_feet
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import System, make_system, thin_plate
-from jaxfit._splines._pieces import Axis, Pieces
+
+
+class StandardState(eqx.Module):
+    """lambda, and by what share of its diagonal a singular matrix was shifted at most."""
+
+    smoothing: Float[Any, ""]
+    shift: Float[Any, ""]
 
 
 class StandardApproximation(AbstractIterativeMethod):
@@ -43,8 +54,8 @@ class StandardApproximation(AbstractIterativeMethod):
     parameter_correction : bool
         False solves once, at the parameters given as `start` or found on the base surface. The loop then
         measures errors at these parameters; the errors of the fit are at true closest points nevertheless.
-    fixed_boundary : bool
-        Hold the border control points (section 2.3); otherwise only the four corners.
+    border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
+        Which control points on the border of the net stay (default all of them, section 2.3).
     solver : GaussNewton(), LevenbergMarquardt(), JaxoptGaussNewton() or JaxoptLevenbergMarquardt()
         How the least-squares problem is solved (default GaussNewton, direct). All agree to rounding.
     insertion : KnotInsertion(), optional
@@ -70,7 +81,7 @@ class StandardApproximation(AbstractIterativeMethod):
 
     smoothing: Any = 2e-5
     parameter_correction: bool = True
-    fixed_boundary: bool = True
+    border: AbstractBorder = FixedBorder()
     solver: Any = GaussNewton()
     insertion: KnotInsertion | None = None
     loss: Any = None
@@ -78,9 +89,6 @@ class StandardApproximation(AbstractIterativeMethod):
     foot_tolerance: float = 1e-12
     stall_window: int = 20
     stall_gain: float = 2e-3
-
-    counts: ClassVar[bool] = True
-    solves: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not self.parameter_correction:
@@ -92,55 +100,82 @@ class StandardApproximation(AbstractIterativeMethod):
             check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
-        check_switches(self, ("fixed_boundary", "parameter_correction"))
+        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
+        check_number("foot_tolerance", self.foot_tolerance, 0.0)
+        check_number("stall_window", self.stall_window, 1, whole=True)
+        check_number("stall_gain", self.stall_gain, 0.0)
+        check_switches(self, ("parameter_correction",))
 
-    def prepared(self, problem: Any) -> tuple["StandardApproximation", Any]:
-        """With lambda moved into the problem, so that another one compiles nothing; 0 until it is chosen."""
-        value = 0.0 if isinstance(self.smoothing, AbstractSmoothing) else self.smoothing
-        return eqx.tree_at(lambda m: m.smoothing, self, 0.0), problem.smoothed(value)
+    @property
+    def finds_feet(self) -> bool:
+        """Whether parameters are corrected, and so are foot points."""
+        return self.parameter_correction
 
-    def held(self, axes: tuple[Axis, Axis], net: Array) -> Bool[Array, "nu nv"]:
+    @property
+    def stall_since(self) -> int:
+        """From the first iteration on."""
+        return 0
+
+    def init(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection
+    ) -> tuple[WorkingSurface, StandardState]:
+        """lambda as given, or chosen from the data."""
+        if isinstance(self.smoothing, AbstractSmoothing):
+            smoothing = chosen(self.smoothing, self, problem, surface, projection)
+        else:
+            smoothing = as_smoothing(self.smoothing, problem.target.dtype)
+        xp: Any = np if is_concrete(problem, smoothing) else jnp
+        surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
+        return surface, StandardState(smoothing, xp.zeros_like(smoothing))
+
+    def held(self, surface: WorkingSurface) -> Bool[Any, "nu nv"]:
         """Which control points stay."""
-        return border_on(axes, net.shape, corners_only=not self.fixed_boundary)
+        return held_points(self.border, surface.control_points.shape, surface.used)
 
-    def system(self, problem: Any, pieces: Pieces, measured: Measured) -> System:
+    def system(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection, smoothing: Any
+    ) -> System:
         """The least-squares problem at the present parameters."""
-        length = loss_length(self.loss, problem, measured.error)
-        weight = reweighted(self.loss, length, problem.weight, measured.error)
-        return make_system(pieces, measured.u, measured.v, problem.target, weight, problem.smoothing)
+        length = loss_length(self.loss, problem, projection.error)
+        weight = reweighted(self.loss, length, problem.weight, projection.error)
+        parameters = projection.u, projection.v
+        return make_system(surface.pieces, *parameters, problem.target, weight, smoothing)
 
-    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
-        """The net of least squares at the present parameters."""
-        held = self.held((pieces.axis_u, pieces.axis_v), turn.net)
-        net, shift = self.solver(posed(self.system(problem, pieces, measured), held, turn.net))
-        before: Any = turn.shift
-        step, growth = turn.step + 1, turn.growth
-        if self.insertion is not None and growth is not None:
-            net, growth = self.insertion(step, net, growth, measured, problem.padding > 0)
-        return Turn(net, step, turn.records, growth, jnp.maximum(before, shift))
-
-    def measure(
-        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
-    ) -> Measured:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
         """New parameters, or the errors at the old ones."""
-        idle = problem.padding <= 0
-        active = jnp.sum(problem.weight > 0, dtype=jnp.int32)
+        pieces, before = iterate.surface.pieces, iterate.projection
+        idle = ~jnp.asarray(problem.real)
         if self.parameter_correction:
-            feet = measure_feet(self.foot_method, problem, pieces, measured, idle, borders=False)
-            return eqx.tree_at(lambda m: m.active, feet, active, is_leaf=lambda x: x is None)
-        error = values_at(pieces, measured.u, measured.v) - problem.target
+            here = measure_feet(
+                self.foot_method, problem, pieces, before, self.foot_tolerance, idle, borders=False
+            )
+            return here, iterate.state
+        error = values_at(pieces, before.u, before.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
-        return Measured(measured.u, measured.v, distance, measured.steps, ~jnp.asarray(idle), active)
+        active = jnp.sum(problem.counted, dtype=jnp.int32)
+        here = Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
+        return here, iterate.state
 
+    def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
+        """The new one, always."""
+        return new
 
-def with_smoothing(rule: Any, method: StandardApproximation, problem: Any, net: Array, u: Any, v: Any) -> Any:
-    """The problem with the lambda that a rule chooses; as it is where lambda was given as a number."""
-    if not isinstance(rule, AbstractSmoothing):
-        return problem
-    return eqx.tree_at(lambda p: p.smoothing, problem, chosen(rule, method, problem, net, u, v))
+    def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
+        """The net of least squares at the present parameters, and new knots."""
+        surface, here, state = iterate.surface, iterate.projection, iterate.state
+        system = self.system(problem, surface, here, state.smoothing)
+        net, shift = self.solver(posed(system, self.held(surface), surface.control_points))
+        surface, step = surface.moved_to(net), iterate.step + 1
+        if self.insertion is not None:
+            surface = self.insertion(step, surface, here, problem.counted)
+        state = StandardState(state.smoothing, jnp.maximum(state.shift, shift))
+        return Iterate(surface, here, state, step), history
 
-
-@jax.jit
-def bending_energy(net: Array, axis_u: Axis, axis_v: Axis) -> Array:
-    """The integral (10) of a net."""
-    return thin_plate(axis_u, axis_v).energy(net)
+    def postprocess(
+        self, problem: Problem, iterate: Iterate, stopped_early: Array
+    ) -> tuple[Iterate, dict[str, Any]]:
+        """lambda, the integral (10), and the largest shift."""
+        energy = thin_plate(*iterate.surface.axes).energy(iterate.surface.control_points)
+        stats = {"bending_energy": energy * problem.scale**2}
+        return iterate, stats | {"smoothing": iterate.state.smoothing, "shift": iterate.state.shift}

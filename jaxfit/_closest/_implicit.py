@@ -116,7 +116,8 @@ def foot_change(
     low_u, high_u, low_v, high_v = within
     free_u = _free(u, gu, E, low_u, high_u, tolerance)
     free_v = _free(v, gv, G, low_v, high_v, tolerance)
-    return _solve(*hessian, E, G, *changes, free_u, free_v)
+    (a, b, c), (x, y) = hessian, changes
+    return _solve(a, b, c, E, G, x, y, free_u, free_v)
 
 
 def _ends(knots: Array, order: int) -> tuple[Array, Array]:

@@ -1,14 +1,14 @@
-"""What the geometric methods share: feet brought up to date, and the border of a net."""
+"""Feet brought up to date on a surface that has moved."""
 
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Bool
 
 from jaxfit._closest import AbstractFootMethod, Border, project
-from jaxfit._fit._loop import Measured
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
 from jaxfit._splines._pieces import Axis, Pieces
 
 FOOT_STEPS = 40
@@ -16,13 +16,14 @@ FOOT_STEPS = 40
 
 def measure_feet(
     method: AbstractFootMethod,
-    problem: Any,
+    problem: Problem,
     pieces: Pieces,
-    measured: Measured,
+    before: Projection,
+    foot_tolerance: Any,
     idle: Bool[Any, " points"],
     borders: bool,
     within: Border | None = None,
-) -> Measured:
+) -> Projection:
     """Feet from the last ones, converged on the surface, and the errors there; `idle` points have none.
 
     `borders` and `within` are those of `project`.
@@ -31,34 +32,17 @@ def measure_feet(
         method,
         pieces,
         problem.target,
-        measured.u,
-        measured.v,
-        problem.foot_tolerance * problem.diagonal,
+        before.u,
+        before.v,
+        foot_tolerance * problem.diagonal,
         jnp.asarray(FOOT_STEPS, jnp.int32),
         jnp.asarray(idle),
         borders,
         within,
     )
     error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
-    return Measured(feet.best_u, feet.best_v, error, feet.steps, feet.converged)
-
-
-def border(nu: int, nv: int, corners_only: bool) -> Bool[np.ndarray, "nu nv"]:
-    """Which control points lie on the border of the net, or only its corners."""
-    return _border(np.arange(nu), np.arange(nv), nu, nv, corners_only)
-
-
-def border_on(axes: tuple[Axis, Axis], shape: tuple[int, ...], corners_only: bool) -> Bool[Array, "nu nv"]:
-    """The same of a net with room for more; the surplus counts as border."""
-    number_u, number_v = jnp.arange(shape[0]), jnp.arange(shape[1])
-    held = _border(number_u, number_v, axes[0].used, axes[1].used, corners_only)
-    return held | (number_u >= axes[0].used)[:, None] | (number_v >= axes[1].used)[None, :]
-
-
-def _border(number_u: Any, number_v: Any, nu: Any, nv: Any, corners_only: bool) -> Any:
-    end_u = ((number_u == 0) | (number_u == nu - 1))[:, None]
-    end_v = ((number_v == 0) | (number_v == nv - 1))[None, :]
-    return end_u & end_v if corners_only else end_u | end_v
+    active = jnp.sum(problem.counted, dtype=jnp.int32)
+    return Projection(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True))
 
 
 def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> Border:

@@ -1,6 +1,11 @@
 """How a fit can end: an enumeration whose values are the sentences that users read."""
 
+from typing import Any
+
 import equinox as eqx
+import numpy as np
+
+from jaxfit._checks import is_concrete
 
 
 class RESULTS(eqx.Enumeration):
@@ -28,3 +33,14 @@ class RESULTS(eqx.Enumeration):
         "some normals lie in the surface through the points or on its other side, so that it would have to "
         "fold; check their directions and signs."
     )
+
+
+def code_of(result: Any) -> int:
+    """The number behind an item of RESULTS."""
+    return int(np.asarray(result._value))
+
+
+def result_of(code: Any) -> Any:
+    """The item of RESULTS with this number, traced or not."""
+    item: Any = type(RESULTS.running)
+    return item(np.asarray(code, np.int32) if is_concrete(code) else code, RESULTS)

@@ -4,13 +4,14 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from equinox import AbstractClassVar
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._fit._loop import GROWTH, Limits, Records, Turn
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._loop import MAX_GROWTH
+from jaxfit._fit._problem import Tolerances
 from jaxfit._interpolation._point_collocation import PointCollocation
 
 
@@ -87,35 +88,44 @@ class System(eqx.Module):
     diagonal: Float[Array, ""]
 
 
-def iterate_frozen(method: Any, limits: Limits, system: System, most: Array, turn: Turn) -> Turn:
+def iterate_frozen(
+    method: Any,
+    limits: Tolerances,
+    system: System,
+    most: Array,
+    net: Float[Array, "nu nv d"],
+    first: Array,
+    history: ErrorHistory,
+) -> tuple[Float[Array, "nu nv d"], Array, ErrorHistory]:
     """Moves with the feet held, at least one and up to `most`, until errors meet the tolerances or stall.
 
-    Records the errors at the held feet. Unless `most` ended it, the net it ends with has been recorded.
+    Records the errors at the held feet, but those of step `first`, which is known exactly. Unless `most`
+    ended it, the net it ends with has been recorded.
     """
     is_close, times_close = system.collocation.is_close(), system.collocation.times_close()
-    last = turn.step + most
+    last = first + most
+    exact = history.at(first)
     acceleration: AbstractAcceleration = method.acceleration
 
-    def body(x: tuple[Array, Array, Array, Records, Any]) -> tuple[Array, Array, Array, Records, Any]:
-        _, net, step, records, state = x
+    def body(x: tuple[Array, Array, Array, ErrorHistory, Any]) -> Any:
+        _, net, step, history, state = x
         e = system.target - lax.cond(is_close, times_close, lambda net: system.collocation.times(net), net)
         square: Any = sum(e[1:] ** 2, e[0] ** 2)
         error = jnp.where(system.held, 0.0, jnp.sqrt(square)) / system.diagonal
         average, maximum = jnp.mean(error), jnp.max(error)
-        records = records.at(step, average, maximum, 0.0, 0.0)
+        history = history.append(step, (average, maximum, 0.0, 0.0))
         met = (average <= limits.average) & (maximum <= limits.maximum)
-        sound = jnp.isfinite(average) & (average <= GROWTH * records.average[0])
-        stalled = records.is_stalled(step, method.stall_window, method.stall_gain)
-        on = (step == turn.step) | (sound & ~met & (step < limits.max_steps) & ~stalled)
+        sound = jnp.isfinite(average) & (average <= MAX_GROWTH * history.first)
+        stalled = history.is_stalled(step, method.stall_window, method.stall_gain)
+        on = (step == first) | (sound & ~met & (step < limits.max_steps) & ~stalled)
         still = system.held | (error <= limits.maximum) if method.local else system.held
         shift = jnp.where(still[None], 0.0, system.weight[None] * e)
         move, state = acceleration.step(shift, state)
-        return on, net + jnp.where(on, move, 0.0), step + on, records, state
+        return on, net + jnp.where(on, move, 0.0), step + on, history, state
 
-    net = jnp.moveaxis(turn.net, -1, 0)
+    net = jnp.moveaxis(net, -1, 0)
     state = acceleration.init(net, system.weight, system.lowest)
-    begin = (jnp.asarray(True), net, turn.step, turn.records, state)
-    _, net, step, records, _ = lax.while_loop(lambda x: x[0] & (x[2] < last), body, begin)
+    begin = (jnp.asarray(True), net, first, history, state)
+    _, net, step, history, _ = lax.while_loop(lambda x: x[0] & (x[2] < last), body, begin)
     # The first entry is that of the exact errors, which the loop has written over.
-    exact = jax.tree.map(lambda x, y: x.at[turn.step].set(y[turn.step]), records, turn.records)
-    return Turn(jnp.moveaxis(net, 0, -1), step, exact, turn.growth)
+    return jnp.moveaxis(net, 0, -1), step, history.append(first, exact)

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._closest import Border, project
+from jaxfit._closest import Border
 from jaxfit._closest._implicit import foot_change
-from jaxfit._fit._measure import FOOT_STEPS, border, side_bounds
-from jaxfit._fit._problem import axes_of_averages
+from jaxfit._fit._border import corners
+from jaxfit._fit._measure import side_bounds
 from jaxfit._interpolation._point_collocation import PointCollocation, at_cells, control_point_windows
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
 from jaxfit._interpolation._solution_derivative import with_derivative
-from jaxfit._splines._pieces import Axis, pieces_on
+from jaxfit._splines._pieces import Axis, make_axis
 
 NOISE = 1e3  # rounding units of the diagonal: a point so close counts as met
 SHORT = 8  # moves: as many are remembered whole rather than made twice
@@ -52,46 +52,51 @@ class Fitted(eqx.Module):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def attach_derivative(method: Any, order: tuple[int, int], fitted: Fitted, inputs: FitInputs) -> Fitted:
-    """`fitted`, with the derivative in `inputs` that the method's adjoint asks for."""
+def attach_derivative(
+    method: Any,
+    order: tuple[int, int],
+    fitted: Fitted,
+    path: Float[Array, "moves 2 points"],
+    inputs: FitInputs,
+) -> Fitted:
+    """`fitted`, with the derivative in `inputs` that the method's adjoint asks for.
+
+    `path` holds the feet before each of the first moves, or nothing where they are not followed.
+    """
     return fitted
 
 
 @attach_derivative.defjvp
 def _attach_jvp(method: Any, order: tuple[int, int], primals: Any, tangents: Any) -> Any:
-    fitted, inputs = primals
-    fitted = attach_derivative(method, order, fitted, inputs)  # for derivatives of the derivative
-    return jax.jvp(partial(_replayed, method, order, fitted), (inputs,), tangents[1:])
+    fitted, path, inputs = primals
+    fitted = attach_derivative(method, order, fitted, path, inputs)  # for derivatives of the derivative
+    return jax.jvp(partial(_replayed, method, order, fitted, path), (inputs,), tangents[2:])
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _replayed(method: Any, order: tuple[int, int], fitted: Fitted, inputs: FitInputs) -> Fitted:
+def _replayed(method: Any, order: tuple[int, int], fitted: Fitted, path: Array, inputs: FitInputs) -> Fitted:
     """`fitted` as a function of what the fit started from."""
-    moves = method.adjoint.moves(method.freeze_after)
-    u, v = fitted.u, fitted.v
-    if moves is None:
-        axes = lax.stop_gradient(axes_of_averages(inputs.knots, order))
-    else:
-        axes = axes_of_averages(inputs.knots, order)
-        feet = _feet_after(moves, method, axes, inputs)
+    u, v, knots = fitted.u, fitted.v, inputs.knots
+    knots = knots if path.shape[0] else lax.stop_gradient(knots)
+    axes = make_axis(knots[0], order[0], simple=True), make_axis(knots[1], order[1], simple=True)
+    if path.shape[0]:
+        feet = _feet_along(lax.stop_gradient(path), method, axes, inputs)
         # The values are those of the fit, which may have looked for its feet again at the end.
         u, v = (x + (y - lax.stop_gradient(y)) for x, y in zip((u, v), feet, strict=True))
     net = with_derivative(RESTART, fitted.net, (u, v), axes, None, inputs.data)
     return Fitted(net, u, v)
 
 
-def _feet_after(moves: int, method: Any, axes: tuple[Axis, Axis], inputs: FitInputs) -> Pair:
-    """The feet when the net has moved so often, as a differentiable function of axes and inputs."""
+def _feet_along(path: Array, method: Any, axes: tuple[Axis, Axis], inputs: FitInputs) -> Pair:
+    """The last feet of the path, as a differentiable function of axes and inputs."""
     replay = FootReplay.of(method, axes, inputs)
-    fixed = lax.stop_gradient(replay)
-    feet = jax.tree.map(jnp.asarray, inputs.feet)
-    net = replay.data
-    steps = lax.scan(
-        lambda x, _: fixed.step(x, fixed.search(*x)), lax.stop_gradient((net, feet)), None, length=moves + 1
-    )[1]
-    step = lambda x, feet: replay.step(x, feet)
-    step = jax.checkpoint(step) if moves > SHORT else step
-    return lax.scan(step, (net, feet), steps)[0][1]
+
+    def step(before: tuple[Array, Pair], feet: Array) -> tuple[tuple[Array, Pair], None]:
+        return replay.step(before, feet), None
+
+    begin = (replay.data, jax.tree.map(jnp.asarray, inputs.feet))
+    path = path.reshape(*path.shape[:2], *inputs.data.shape[:2])
+    return lax.scan(jax.checkpoint(step) if len(path) > SHORT else step, begin, path)[0][1]
 
 
 class SpanTable(eqx.Module):
@@ -138,33 +143,25 @@ class FootReplay(eqx.Module):
         limits = inputs.diagonal, inputs.tolerance * inputs.diagonal, inputs.foot_tolerance * inputs.diagonal
         return FootReplay(method, axes, (tables[0], tables[1]), data, within, *limits, lowest)
 
-    def search(self, net: Array, feet: Pair) -> Pair:
-        """Closest points from the last ones."""
-        pieces = pieces_on(jnp.moveaxis(net, 0, -1), *self.axes)
-        u, v = (x.reshape(-1) for x in feet)
-        steps, idle = jnp.asarray(FOOT_STEPS, jnp.int32), jnp.asarray(self.held.reshape(-1))
-        target = self.data.reshape(len(net), -1)
-        how = self.method.foot_method
-        new = project(how, pieces, target, u, v, self.foot_tolerance, steps, idle, True, self.within)
-        return new.best_u.reshape(net.shape[1:]), new.best_v.reshape(net.shape[1:])
-
     @property
     def held(self) -> Any:
         """The corners, which never move."""
-        return border(self.data.shape[1], self.data.shape[2], corners_only=True)
+        return corners(*self.data.shape[1:])
 
-    def step(self, before: tuple[Array, Pair], feet: Pair) -> tuple[tuple[Array, Pair], Pair]:
-        """One move of the net, the values of its feet being known."""
+    def step(self, before: tuple[Array, Pair], path: Float[Array, "2 nu nv"]) -> tuple[Array, Pair]:
+        """One move of the net, the values of its feet being known; feet that are not stay where they are."""
         net, method = before[0], self.method
+        feet = tuple(jnp.where(jnp.isnan(x), y, x) for x, y in zip(path, before[1], strict=True))
+        feet = lax.stop_gradient(feet)
         cells = tuple(axis.locate(x) for axis, x in zip(self.axes, feet, strict=True))
-        u, v, e, *basis = at_feet(self, cells, feet, *before)
+        u, v, e, *basis = at_feet(self, cells, feet, jnp.isnan(path[0]), *before)
         weight = method.repositioning.weights(PointCollocation(*cells, *basis), self.lowest)
         still = self.held
         if method.local:
             still = still | (jnp.sum(e**2, axis=0) <= self.tolerance**2)
         shift = jnp.where(still[None], 0.0, weight[None] * e)
         move, _ = method.acceleration.step(shift, method.acceleration.init(shift, weight, self.lowest))
-        return (net + move, (u, v)), feet
+        return net + move, (u, v)
 
     def partials(self, net: Array, cells: Pair, u: Array, v: Array) -> tuple[Array, Array, Array]:
         """All derivatives of R up to the second in either parameter, (3, 3, d, nu, nv), and those of the
@@ -177,7 +174,9 @@ class FootReplay(eqx.Module):
         return jnp.sum(rows[None] * along_u[:, None, None], axis=3), along_u, along_v
 
 
-def _values_at(replay: FootReplay, cells: Pair, feet: Pair, net: Array, before: Pair) -> tuple[Array, ...]:
+def _values_at(
+    replay: FootReplay, cells: Pair, feet: Pair, unknown: Array, net: Array, before: Pair
+) -> tuple[Array, ...]:
     partials, along_u, along_v = replay.partials(net, cells, *feet)
     return *feet, replay.data - partials[0, 0], along_u[0], along_v[0]
 
@@ -187,7 +186,9 @@ at_feet = jax.custom_jvp(_values_at)
 
 
 @jax.custom_jvp
-def _parameters_at(replay: FootReplay, cells: Pair, feet: Pair, net: Array, before: Pair) -> Pair:
+def _parameters_at(
+    replay: FootReplay, cells: Pair, feet: Pair, unknown: Array, net: Array, before: Pair
+) -> Pair:
     return feet
 
 
@@ -200,8 +201,8 @@ def _parameters_jvp(primals: Any, tangents: Any) -> Any:
 @at_feet.defjvp
 def _linearised(primals: Any, tangents: Any) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """What `at_feet` gives, and how it follows net, data and knots."""
-    replay, cells, _, net, _ = primals
-    d_replay, _, _, d_net, d_before = tangents
+    replay, cells, _, unknown, net, _ = primals
+    d_replay, _, _, _, d_net, d_before = tangents
     u, v = _parameters_at(*primals)  # for derivatives of the derivative
 
     def partials(tables: Any, net: Array) -> tuple[Array, Array, Array]:
@@ -225,7 +226,7 @@ def _linearised(primals: Any, tangents: Any) -> tuple[tuple[Array, ...], tuple[A
     du, dv = foot_change((u, v), slopes, form, hessian, changes, within, replay.foot_tolerance)
     # Where a point is met to rounding, its foot follows that before: which way it would move is noise.
     noise = NOISE * jnp.finfo(net.dtype).eps * replay.diagonal
-    still = replay.held | (jnp.sum(e**2, axis=0) <= noise**2)
+    still = replay.held | unknown | (jnp.sum(e**2, axis=0) <= noise**2)
     du, dv = (jnp.where(still, old, new) for old, new in zip(d_before, (du, dv), strict=True))
     de = de - r[1, 0] * du[None] - r[0, 1] * dv[None]
     d_basis_u = d_along_u[0] + along_u[1] * du[None]

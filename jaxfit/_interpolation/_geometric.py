@@ -1,24 +1,54 @@
 """Geometric interpolation of grids: section 3 of the paper."""
 
-from typing import Any, ClassVar
+from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
 
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
-from jaxfit._fit._measure import border, measure_feet, side_bounds
-from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
-from jaxfit._interpolation._repositioning import AbstractRepositioning, OptimalRepositioning
-from jaxfit._interpolation._point_collocation import point_collocation
+from jaxfit._fit._border import corners
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._measure import measure_feet, side_bounds
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._result import Fit
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
+from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
+from jaxfit._interpolation._geometric_fit import geometric_fit
+from jaxfit._interpolation._method import (
+    AbstractInterpolation,
+    GridProblem,
+    Progress,
+    finish,
+    refuse_normals,
+)
+from jaxfit._interpolation._point_collocation import point_collocation
+from jaxfit._interpolation._repositioning import AbstractRepositioning, OptimalRepositioning
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
-from jaxfit._splines._pieces import Pieces
 
 
-class GeometricInterpolation(AbstractIterativeMethod):
+class GeometricState(eqx.Module):
+    """The surface with the smallest maximum error so far; feet before the first moves, which derivatives
+    replay (NaN where there are none); and the smallest eigenvalue of the collocation matrix, where a choice
+    of the method asks for it.
+    """
+
+    best: WorkingSurface
+    projection: Projection
+    maximum: Float[Any, ""]
+    path: Float[Any, "moves 2 points"]
+    lowest: Float[Any, ""]
+
+
+class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     r"""Move every control point by the error vector of its own data point, until all vanish.
 
     The control net starts as the data (12). In every iteration the closest point of each $Q_{ij}$ on the
@@ -92,8 +122,6 @@ class GeometricInterpolation(AbstractIterativeMethod):
     stall_window: int = 40
     stall_gain: float = 0.1
 
-    keeps_best: ClassVar[bool] = True
-
     def __check_init__(self) -> None:
         for name, kind, example in (
             ("parametrisation", AbstractParametrisation, "ChordLength()"),
@@ -107,32 +135,93 @@ class GeometricInterpolation(AbstractIterativeMethod):
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
+    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+        """None can be met."""
+        refuse_normals(self, normals)
+
+    def fit(self, problem: GridProblem, progress: Progress | None) -> Fit:
+        """Parameters and knots, and the loop."""
+        return finish(*geometric_fit(self, problem, progress))
+
     @property
     def needs_spectrum(self) -> bool:
         """Whether the smallest eigenvalue of the collocation matrix plays a part."""
         return self.repositioning.needs_spectrum or self.acceleration.needs_spectrum
 
-    def move(self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, turn: Turn) -> Turn:
-        """Equations (13) and (14) once, or as often as the frozen feet allow."""
-        nu, nv, _ = turn.net.shape
-        target = problem.target.reshape(-1, nu, nv)
-        axes = (pieces.axis_u, pieces.axis_v)
-        collocation = point_collocation(axes, measured.u.reshape(nu, nv), measured.v.reshape(nu, nv))
-        held = border(nu, nv, corners_only=True)
-        lowest = jnp.ones_like(problem.diagonal) if problem.lowest is None else problem.lowest
-        weight = self.repositioning.weights(collocation, lowest)
-        system = System(collocation, target, weight, held, lowest, problem.diagonal)
-        if self.freeze_after is None:
-            most = jnp.ones_like(turn.step)
-        else:
-            most = jnp.where(turn.step < self.freeze_after, 1, limits.max_steps)
-        return iterate_frozen(self, limits, system, most, turn)
+    @property
+    def stall_since(self) -> int:
+        """From the first iteration on."""
+        return 0
 
-    def measure(
-        self, problem: Any, limits: Limits, pieces: Pieces, measured: Measured, exact: Array
-    ) -> Measured:
+    @property
+    def finds_feet(self) -> bool:
+        """Always."""
+        return True
+
+    def init(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection
+    ) -> tuple[WorkingSurface, GeometricState]:
+        """Nothing is known yet; whoever needs the eigenvalue sets it."""
+        xp: Any = np if is_concrete(problem) else jnp
+        far = xp.asarray(np.inf, problem.target.dtype)
+        moves = self.adjoint.moves(self.freeze_after)
+        path = np.full((0 if moves is None else moves + 1, 2, problem.target.shape[1]), np.nan, far.dtype)
+        return surface, GeometricState(surface, projection, far, path, xp.ones_like(far))
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
         """Closest points from the last ones."""
-        nu, nv = (x.cells + k - 1 for x, k in zip((pieces.axis_u, pieces.axis_v), pieces.order, strict=True))
-        corners = border(nu, nv, corners_only=True).reshape(-1)
-        within = side_bounds((pieces.axis_u, pieces.axis_v), nu, nv) if self.keep_borders else None
-        return measure_feet(self.foot_method, problem, pieces, measured, corners, True, within)
+        surface = iterate.surface
+        nu, nv = surface.control_points.shape[:2]
+        held = corners(nu, nv).reshape(-1)
+        within = side_bounds(surface.axes, nu, nv) if self.keep_borders else None
+        here = measure_feet(
+            self.foot_method,
+            problem,
+            surface.pieces,
+            iterate.projection,
+            self.foot_tolerance,
+            held,
+            True,
+            within,
+        )
+        state: GeometricState = iterate.state
+        maximum, path = jnp.max(here.error), state.path
+        if path.shape[0]:
+            path = path.at[iterate.step].set(jnp.stack([here.u, here.v]), mode="drop")
+        parts = ((surface, here, maximum), (state.best, state.projection, state.maximum))
+        *best, least = jax.tree.map(lambda x, y: lax.select(maximum < state.maximum, x, y), *parts)
+        return here, GeometricState(best[0], best[1], least, path, state.lowest)
+
+    def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
+        """The new one: errors may rise on the way."""
+        return new
+
+    def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
+        """Equations (13) and (14) once, or as often as the frozen feet allow."""
+        surface, here = iterate.surface, iterate.projection
+        nu, nv = surface.control_points.shape[:2]
+        target = problem.target.reshape(-1, nu, nv)
+        collocation = point_collocation(surface.axes, here.u.reshape(nu, nv), here.v.reshape(nu, nv))
+        lowest = iterate.state.lowest
+        weight = self.repositioning.weights(collocation, lowest)
+        system = System(collocation, target, weight, corners(nu, nv), lowest, problem.diagonal)
+        if self.freeze_after is None:
+            most = jnp.ones_like(iterate.step)
+        else:
+            most = jnp.where(iterate.step < self.freeze_after, 1, problem.tolerances.max_steps)
+        net, step, history = iterate_frozen(
+            self, problem.tolerances, system, most, surface.control_points, iterate.step, history
+        )
+        return Iterate(surface.moved_to(net), here, iterate.state, step), history
+
+    def postprocess(
+        self, problem: Problem, iterate: Iterate, stopped_early: Array
+    ) -> tuple[Iterate, dict[str, Any]]:
+        """The best surface, if the errors have stopped falling before the end."""
+        best: GeometricState = iterate.state
+        found = (best.best, best.projection)
+        early = stopped_early & jnp.isfinite(best.maximum)
+        surface, projection = jax.tree.map(
+            lambda x, y: lax.select(early, x, y), found, (iterate.surface, iterate.projection)
+        )
+        return Iterate(surface, projection, best, iterate.step), {}

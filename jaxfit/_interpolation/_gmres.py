@@ -5,43 +5,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float, Int
+from jaxtyping import Float
+
+from jaxfit._fit._history import ErrorHistory
 
 Operator = Callable[[Array], Array]
 
 SLOW = 0.9  # a cycle that leaves more of the largest error than this is the last
-
-
-class ErrorHistory(eqx.Module):
-    """Errors of every net so far, and the number of cycles behind the last.
-
-    Cycles beyond the length of the arrays share the last entry.
-    """
-
-    step: Int[Array, ""]
-    average: Float[Array, " steps"]
-    maximum: Float[Array, " steps"]
-
-    @staticmethod
-    def start(capacity: int, errors: Array) -> "ErrorHistory":
-        """With the errors before the first cycle."""
-        empty = jnp.full(capacity, jnp.nan, errors.dtype)
-        zero = jnp.zeros((), jnp.int32)
-        return ErrorHistory(zero, empty, empty).append(zero, errors)
-
-    def append(self, step: Array, errors: Array) -> "ErrorHistory":
-        """With the errors after `step` cycles."""
-        average = self.average.at[self._entry(step)].set(jnp.mean(errors))
-        maximum = self.maximum.at[self._entry(step)].set(jnp.max(errors))
-        return ErrorHistory(step, average, maximum)
-
-    def last(self) -> tuple[Array, Array]:
-        """The last average and maximum."""
-        entry = self._entry(self.step)
-        return self.average[entry], self.maximum[entry]
-
-    def _entry(self, step: Array) -> Array:
-        return jnp.minimum(step, self.average.shape[0] - 1)
 
 
 class Limits(eqx.Module):
@@ -57,39 +27,45 @@ def distances(residual: Float[Array, "n m d"], diagonal: Array) -> Float[Array, 
     return jnp.sqrt(jnp.sum(residual**2, axis=-1)) / diagonal
 
 
+def append_errors(history: ErrorHistory, step: Array, errors: Float[Array, "n m"]) -> ErrorHistory:
+    """With the errors after `step` cycles, for which no feet are found."""
+    return history.append(step, (jnp.mean(errors), jnp.max(errors), 0.0, 0.0))
+
+
 def gmres_solve(
     apply: Operator,
     precondition: Operator,
     right: Float[Array, "n m d"],
     x: Float[Array, "n m d"],
+    step: Array,
     history: ErrorHistory,
     limits: Limits,
     restart: int,
-) -> tuple[Array, ErrorHistory]:
-    """Cycles from `x`, whose errors are the last in `history`, until the largest error is within the
-    tolerance, or a cycle takes less than a tenth of it away, or all are done.
+) -> tuple[Array, Array, ErrorHistory]:
+    """Cycles from `x`, whose errors are those of `step` in `history`, until the largest error is within the
+    tolerance, or a cycle takes less than a tenth of it away, or all are done. The last step is returned, too.
 
     A cycle that makes the largest error greater is not accepted.
     """
-    State = tuple[Array, Array, ErrorHistory, Array]
+    State = tuple[Array, Array, Array, ErrorHistory, Array]
 
     def goes_on(state: State) -> Array:
-        _, _, history, slow = state
-        return ~slow & (history.last()[1] > limits.tolerance) & (history.step < limits.max_steps)
+        _, _, step, history, slow = state
+        return ~slow & (history.at(step)[1] > limits.tolerance) & (step < limits.max_steps)
 
     def cycle(state: State) -> State:
-        x, residual, history, _ = state
+        x, residual, step, history, _ = state
         moved = x + gmres_cycle(apply, precondition, residual, restart)
         rest = right - apply(moved)
-        before, after = history.last()[1], jnp.max(distances(rest, limits.diagonal))
+        before, after = history.at(step)[1], jnp.max(distances(rest, limits.diagonal))
         better = after < before
         x, residual = (jnp.where(better, new, old) for new, old in ((moved, x), (rest, residual)))
-        history = history.append(history.step + 1, distances(residual, limits.diagonal))
-        return x, residual, history, ~(after < SLOW * before)
+        history = append_errors(history, step + 1, distances(residual, limits.diagonal))
+        return x, residual, step + 1, history, ~(after < SLOW * before)
 
-    begin = (x, right - apply(x), history, jnp.asarray(False))
-    x, _, history, _ = lax.while_loop(goes_on, cycle, begin)
-    return x, history
+    begin = (x, right - apply(x), step, history, jnp.asarray(False))
+    x, _, step, history, _ = lax.while_loop(goes_on, cycle, begin)
+    return x, step, history
 
 
 def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: int) -> Array:

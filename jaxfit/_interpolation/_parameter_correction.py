@@ -8,8 +8,9 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest import Newton, project
+from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import FOOT_STEPS
-from jaxfit._interpolation._gmres import ErrorHistory, Limits, distances, gmres_solve
+from jaxfit._interpolation._gmres import Limits, append_errors, distances, gmres_solve
 from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._solution_derivative import times_last
 from jaxfit._interpolation._tensor_collocation import TensorCollocation
@@ -20,6 +21,7 @@ class CollocationProblem(eqx.Module):
     """The data, and what all solves share."""
 
     data: Float[Array, "n m d"]
+    knots: tuple[Array, Array]
     axes: tuple[Axis, Axis]
     tensor: TensorCollocation
     limits: Limits
@@ -39,6 +41,7 @@ class Corrected(eqx.Module):
     net: Array
     u: Array
     v: Array
+    step: Array  # cycles of GMRES so far
     history: ErrorHistory
     number: Array  # of corrections
     change: Array
@@ -47,22 +50,33 @@ class Corrected(eqx.Module):
 
 
 def solved_at(
-    method: Any, problem: CollocationProblem, net: Array, u: Array, v: Array, history: ErrorHistory
+    method: Any,
+    problem: CollocationProblem,
+    net: Array,
+    u: Array,
+    v: Array,
+    step: Array,
+    history: ErrorHistory,
 ) -> Corrected:
-    """The system at these parameters, solved as well as it can be."""
+    """The system at these parameters, solved as well as it can be.
+
+    It starts from `net`, that of `step` in `history`, where its errors still have to be entered.
+    """
     system, precondition = problem.system(u, v), problem.tensor.factorised()
-    net, history = gmres_solve(
+    history = append_errors(history, step, problem.errors(net, u, v))
+    net, step, history = gmres_solve(
         lambda x: times_last(system, x),
         precondition,
         problem.data,
         net,
+        step,
         history,
         problem.limits,
         method.restart,
     )
     zero = jnp.asarray(0, jnp.int32)
     far = jnp.asarray(jnp.inf, net.dtype)
-    return Corrected(net, u, v, history, zero, far, zero, jnp.asarray(False))
+    return Corrected(net, u, v, step, history, zero, far, zero, jnp.asarray(False))
 
 
 def corrected(method: Any, problem: CollocationProblem, found: Corrected) -> Corrected:
@@ -74,7 +88,7 @@ def corrected(method: Any, problem: CollocationProblem, found: Corrected) -> Cor
     still = 100 * float(jnp.finfo(target.dtype).eps)
 
     def goes_on(now: Corrected) -> Array:
-        left = (now.number < method.max_corrections) & (now.history.step < limits.max_steps)
+        left = (now.number < method.max_corrections) & (now.step < limits.max_steps)
         return left & (now.change > still) & ~now.slow
 
     def correct(now: Corrected) -> Corrected:
@@ -83,11 +97,10 @@ def corrected(method: Any, problem: CollocationProblem, found: Corrected) -> Cor
         feet = project(Newton(), pieces, target, *start, method.foot_tolerance * limits.diagonal, steps)
         u, v = feet.best_u.reshape(n, m), feet.best_v.reshape(n, m)
         change = jnp.maximum(jnp.max(jnp.abs(u - now.u)), jnp.max(jnp.abs(v - now.v)))
-        history = now.history.append(now.history.step, problem.errors(now.net, u, v))
-        new = solved_at(method, problem, now.net, u, v, history)
-        before, after = now.history.last()[1], new.history.last()[1]
+        new = solved_at(method, problem, now.net, u, v, now.step, now.history)
+        before, after = now.history.at(now.step)[1], new.history.at(new.step)[1]
         slow = (change > 0.9 * now.change) & (after > 0.9 * before)
         lost = jnp.sum(~feet.converged, dtype=jnp.int32)
-        return Corrected(new.net, u, v, new.history, now.number + 1, change, lost, slow)
+        return Corrected(new.net, u, v, new.step, new.history, now.number + 1, change, lost, slow)
 
     return lax.while_loop(goes_on, correct, found)

@@ -28,7 +28,7 @@ class PointCollocation(eqx.Module):
     def offsets(self) -> tuple[Int[Array, "nu nv"], Int[Array, "nu nv"]]:
         """How far the window of each point begins behind its control point, plus order less 1."""
         (order_u, nu, nv), order_v = self.basis_u.shape, self.basis_v.shape[0]
-        to_u, to_v = (np.arange(k - 1, k - 1 - n, -1, np.int32) for k, n in ((order_u, nu), (order_v, nv)))
+        to_u, to_v = (k - 1 - np.arange(n, dtype=np.int32) for k, n in ((order_u, nu), (order_v, nv)))
         return self.first_u + to_u[:, None], self.first_v + to_v[None, :]
 
     def times(self, net: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
@@ -120,7 +120,7 @@ def _skipped(order: int) -> int:
 
 
 def _coefficients(offset: Array, basis: Array, shifts: Any) -> Float[Array, "shifts nu nv"]:
-    """Of the control points `shift` - (K - 1) places on, for each shift; zero where they are no neighbours."""
+    """Of the control points `shift` - (K - 1) places on, for each shift; zero where there is none."""
     number = np.asarray(shifts, np.int32)[:, None] - np.arange(len(basis), dtype=np.int32)[None, :]
     is_there = offset[None, None] == number[..., None, None]
     return jnp.sum(jnp.where(is_there, basis[None], 0.0), axis=1)

@@ -1,0 +1,31 @@
+"""lambda, the weight of the thin plate, as users give it."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfit._checks import is_concrete
+
+
+def check_smoothing(smoothing: Any) -> None:
+    """Raise unless lambda is a finite number of at least 0, or traced."""
+    if not is_concrete(smoothing):
+        return
+    try:
+        value = np.asarray(np.nan if isinstance(smoothing, bool) else smoothing, np.float64)
+    except (TypeError, ValueError):
+        value = np.asarray(np.nan)
+    if value.ndim or not 0 <= value < np.inf:
+        raise ValueError(
+            f"smoothing must be a finite number of at least 0, but is {smoothing!r}; pass "
+            "lambda, for instance 2e-5."
+        )
+
+
+def as_smoothing(smoothing: Any, dtype: Any) -> Any:
+    """lambda as an array; a traced one that is none becomes NaN, with which no step is finite."""
+    if is_concrete(smoothing):
+        return np.asarray(smoothing, dtype)
+    value = jnp.asarray(smoothing, dtype)
+    return jnp.where(jnp.isfinite(value) & (value >= 0), value, jnp.nan)

@@ -1,0 +1,128 @@
+"""What happened in every iteration: in the loop, and as users see it."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._checks import is_concrete
+from jaxfit._precision import bucket
+
+LEAST_ENTRIES = 1024  # so that other limits on the iterations compile nothing
+MOST_ENTRIES = 1 << 16  # the last so many iterations are kept
+
+
+class ErrorHistory(eqx.Module):
+    """One entry for each iteration, NaN where there has been none; the oldest are written over.
+
+    Rows of `errors`: average and maximum error as fractions of the diagonal, evaluations of the surface for a
+    foot, and change of its parameters since the iteration before, both on average. Rows of `counts`: points
+    that took part, and control points along u and v.
+    """
+
+    errors: Float[Any, "4 steps"]
+    counts: Int[Any, "3 steps"]
+    first: Float[Any, ""]  # average error of the first surface
+
+    @staticmethod
+    def empty(max_steps: int, dtype: Any) -> "ErrorHistory":
+        """With room for all iterations, or for the last MOST_ENTRIES."""
+        entries = min(bucket(max_steps + 1, LEAST_ENTRIES), MOST_ENTRIES)
+        nothing, none = np.full((4, entries), np.nan, dtype), np.zeros((3, entries), np.int32)
+        return ErrorHistory(nothing, none, np.asarray(np.nan, dtype))
+
+    @property
+    def capacity(self) -> int:
+        """How many iterations are kept."""
+        return self.errors.shape[1]
+
+    def append(self, step: Array, errors: Any, counts: Any = None) -> "ErrorHistory":
+        """With the entry of iteration `step`; `counts` stay as they are if not given."""
+        entry = jnp.stack([jnp.asarray(x, self.errors.dtype) for x in errors])
+        at = step % self.capacity
+        first = jnp.where(step == 0, entry[0], self.first)
+        if counts is None:
+            counts = self.counts[:, (step - 1) % self.capacity]
+        return ErrorHistory(self.errors.at[:, at].set(entry), self.counts.at[:, at].set(counts), first)
+
+    def at(self, step: Array) -> Float[Array, "4"]:
+        """The errors of an iteration."""
+        return self.errors[:, step % self.capacity]
+
+    def has_risen(self, step: Array) -> Array:
+        """Whether the average error is greater than in the iteration before."""
+        return self.at(step)[0] > self.at(jnp.maximum(step - 1, 0))[0]
+
+    def is_stalled(self, step: Array, window: int, gain: Any, since: int = 0) -> Array:
+        """Whether neither error has fallen by the share `gain` within `window` iterations, those before
+        `since` not counting.
+        """
+        now, before = self.at(step)[:2], self.at(jnp.maximum(step - window, 0))[:2]
+        return jnp.all(now > (1.0 - gain) * before) & (step >= window + since)
+
+
+class History(eqx.Module):
+    """What happened in every iteration, the first surface included.
+
+    Attributes
+    ----------
+    average, maximum : array (steps,)
+        Errors as fractions of the diagonal: at closest points, or at fixed parameters while a method holds
+        them.
+    evaluations : array (steps,)
+        Evaluations of the surface for a foot, on average over the points.
+    change : array (steps,)
+        Change of a foot's parameters (u plus v) since the iteration before, likewise.
+    active : array (steps,) of int
+        Points that took part.
+    net : array (steps, 2) of int
+        Control points along u and v.
+    faired, refined : array (steps,) of bool
+        Whether fairing, or new knots, have just changed the surface.
+
+    Notes
+    -----
+    The last 65,536 iterations are kept. Inside a transformation, where the number of iterations is not known,
+    the arrays have room for more, and end in NaN.
+    """
+
+    average: Float[Array, " steps"]
+    maximum: Float[Array, " steps"]
+    evaluations: Float[Array, " steps"]
+    change: Float[Array, " steps"]
+    active: Int[Array, " steps"] | None = None
+    net: Int[Array, "steps 2"] | None = None
+    faired: Bool[Array, " steps"] | None = None
+    refined: Bool[Array, " steps"] | None = None
+
+
+def public_history(history: ErrorHistory, last_step: Any, fairing: Any = None) -> History:
+    """The recorded iterations, cut to those made where that number is known."""
+    concrete = is_concrete(history, last_step)
+    xp: Any = np if concrete else jnp  # cut by NumPy: by JAX, every new length would be a new compilation
+    errors, counts = xp.asarray(history.errors), xp.asarray(history.counts)
+    step = np.arange(history.capacity)
+    if concrete:
+        made = int(last_step) + 1
+        step = np.arange(max(made - history.capacity, 0), made)
+        errors, counts = (x[:, step % history.capacity] for x in (errors, counts))
+    faired = np.zeros(step.shape, bool) if fairing is None else (step > 0) & (step % fairing.every == 0)
+    net = counts[1:].T
+    refined = xp.any(net > xp.concatenate([net[:1], net[:-1]]), axis=1)
+    parts = [*errors, counts[0], net, xp.asarray(faired), refined]
+    return History(*(jnp.asarray(x) for x in parts)) if not concrete else _device(parts)
+
+
+def _device(parts: list[Any]) -> History:
+    import jax
+
+    return History(*jax.device_put(parts))
+
+
+def without_counts(history: History) -> History:
+    """The errors alone, as fits of grids report them."""
+    return dataclasses.replace(history, active=None, net=None, faired=None, refined=None)

@@ -1,0 +1,34 @@
+"""Points projected onto a surface: their feet, and how far away these are."""
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Bool, Float, Int
+
+
+class Projection(eqx.Module):
+    """Foot points of all points on a surface, and the errors there.
+
+    Attributes
+    ----------
+    u, v : array (points,)
+        Parameters of the foot points.
+    error : array (points,)
+        |Q - R(u, v)|, in the unit of the problem.
+    evaluations : array (points,) of int
+        Evaluations of the surface spent on each point.
+    converged : array (points,) of bool
+        Whether the foot was found to the tolerance.
+    active : array () of int
+        How many points took part in what the method does next.
+    exact : array () of bool
+        False where errors are predictions. The loop measures once more, exactly, before it stops.
+    """
+
+    u: Float[Any, " points"]
+    v: Float[Any, " points"]
+    error: Float[Any, " points"]
+    evaluations: Int[Any, " points"]
+    converged: Bool[Any, " points"]
+    active: Int[Any, ""]
+    exact: Bool[Any, ""]

@@ -1,0 +1,86 @@
+"""The surface that a fit moves: control points, and knots with all that follows from them."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfit._checks import is_concrete
+from jaxfit._splines._pieces import Axis, Pieces, make_axis, pieces_on
+
+
+class WorkingSurface(eqx.Module):
+    """Control points and knots in the unit of the problem, and both directions of the knots prepared.
+
+    A surface that gets more knots on the way has room for them: surplus control points behind the last one in
+    use, and as many repeats of the last knot. Neither has any influence.
+    """
+
+    control_points: Float[Any, "nu nv d"]
+    knots_u: Float[Any, " knots_u"]
+    knots_v: Float[Any, " knots_v"]
+    axis_u: Axis
+    axis_v: Axis
+
+    @staticmethod
+    def of(control_points: Any, knots_u: Any, knots_v: Any, simple: bool = False) -> "WorkingSurface":
+        """With both axes made; `simple` says that no interior knot repeats (see `make_axis`)."""
+        nu, nv = control_points.shape[:2]
+        axis_u = make_axis(knots_u, knots_u.shape[0] - nu, simple)
+        axis_v = make_axis(knots_v, knots_v.shape[0] - nv, simple)
+        return WorkingSurface(control_points, knots_u, knots_v, axis_u, axis_v)
+
+    @property
+    def axes(self) -> tuple[Axis, Axis]:
+        """Both directions."""
+        return self.axis_u, self.axis_v
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Degree + 1 along u and v."""
+        nu, nv = self.control_points.shape[:2]
+        return self.knots_u.shape[0] - nu, self.knots_v.shape[0] - nv
+
+    @property
+    def pieces(self) -> Pieces:
+        """Polynomial pieces, one for each cell."""
+        return pieces_on(self.control_points, *self.axes)
+
+    @property
+    def used(self) -> Int[Any, "2"]:
+        """How many control points have influence, along u and v."""
+        xp: Any = np if is_concrete(self.axes) else jnp
+        return xp.stack([xp.asarray(axis.used, np.int32) for axis in self.axes])
+
+    def moved_to(self, control_points: Float[Any, "nu nv d"]) -> "WorkingSurface":
+        """The same knots with other control points."""
+        return dataclasses.replace(self, control_points=control_points)
+
+    def padded(self, room: int) -> "WorkingSurface":
+        """With `room` surplus control points in each direction."""
+        net = self.control_points
+        xp: Any = np if is_concrete(net) else jnp
+        net = xp.pad(net, ((0, room), (0, room), (0, 0)), mode="edge")
+        knots = []
+        for x in (self.knots_u, self.knots_v):
+            yp: Any = np if is_concrete(x) else jnp
+            knots.append(yp.concatenate([x, yp.repeat(x[-1:], room)]))
+        wide = WorkingSurface.of(net, *knots)
+        creased = [a.creased or k == 2 for a, k in zip(self.axes, self.order, strict=True)]
+        axes = [dataclasses.replace(a, creased=c) for a, c in zip(wide.axes, creased, strict=True)]
+        return dataclasses.replace(wide, axis_u=axes[0], axis_v=axes[1])
+
+    def trimmed(self) -> "WorkingSurface":
+        """Without surplus control points and knots, as NumPy arrays (concrete)."""
+        nu, nv = (int(x) for x in self.used)
+        order_u, order_v = self.order
+        net, knots_u, knots_v = (np.asarray(x) for x in (self.control_points, self.knots_u, self.knots_v))
+        return WorkingSurface.of(net[:nu, :nv], knots_u[: nu + order_u], knots_v[: nv + order_v])
+
+    def on_device(self) -> "WorkingSurface":
+        """The same, as JAX arrays."""
+        return jax.tree.map(jnp.asarray, self)
