@@ -29,7 +29,7 @@ jax.config.update("jax_enable_x64", True)
 import helpers
 from normal_reference import squares
 
-from jaxfit._approximation._least_squares import GaussNewton, StructuredSolver, posed
+from jaxfit._approximation._least_squares import GaussNewton, StructuredSolver, least_squares_problem
 from jaxfit._fit._measure import border
 from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
@@ -63,7 +63,7 @@ def bare(pieces, net, u, v, points, smoothing):
 
 def _posed(pieces, net, u, v, points, smoothing):
     system = make_system(pieces, u, v, points.T, jnp.ones_like(u), smoothing)
-    return posed(system, border(*net.shape[:2], corners_only=False), net)
+    return least_squares_problem(system, border(*net.shape[:2], corners_only=False), net)
 
 
 def scipy_solve(knots, net, u, v, points, plate):

@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+from jaxfit import _interrupt as _interrupt  # first, for it acts on the other imports
 from jaxfit._approximation import AtParameters as AtParameters
 from jaxfit._approximation import Discrepancy as Discrepancy
 from jaxfit._approximation import Fairing as Fairing

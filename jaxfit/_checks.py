@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 LARGEST = 1e150
 LARGEST_COUNT = 2**31 - 2
+LEAST_STEPS = 1e4  # between which the coordinates of a cloud can choose, along its diagonal
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -41,6 +42,8 @@ def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
     array: Any = x
+    if isinstance(array, np.ma.MaskedArray):
+        array = unmasked(name, array)
     if not isinstance(array, (np.ndarray, jax.Array)):
         try:
             array = np.asarray(array)
@@ -57,9 +60,22 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
         )
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(np.float64 if isinstance(array, np.ndarray) else jnp.result_type(float))
+    elif not array.dtype.isnative:  # JAX takes no other order of bytes
+        array = array.astype(array.dtype.newbyteorder("="))
     if is_concrete(array) and array.size:
         check_finite(name, array)
     return array
+
+
+def unmasked(name: str, x: np.ma.MaskedArray) -> np.ndarray:
+    """The values of a masked array; raises if any is masked, for a fit would take it as data."""
+    count = int(np.ma.count_masked(x))
+    if count:
+        raise ValueError(
+            f"{name} must not be masked, but {count} of its {x.size} entries are; leave out those points, or "
+            "fill them."
+        )
+    return np.ma.getdata(x)
 
 
 def as_vector(name: str, x: ArrayLike | Sequence[float | int], dimension: int | None = None) -> Any:
@@ -102,6 +118,16 @@ def check_magnitude(name: str, x: ArrayLike) -> None:
         raise ValueError(
             f"{name} must be at most {LARGEST:g} in magnitude, so that squares stay within the range of "
             "float64; scale it down."
+        )
+
+
+def check_resolution(name: str, low: np.ndarray, high: np.ndarray, diagonal: float) -> None:
+    """Raise if points in the box from `low` to `high` are so far from the origin that float64 blurs them."""
+    steps = diagonal / (np.finfo(np.float64).eps * max(-low.min(), high.max()))
+    if steps < LEAST_STEPS:
+        raise ValueError(
+            f"{name} must differ by more than the rounding of their coordinates, but the diagonal of their "
+            f"bounding box is only {steps:.3g} units of it; subtract their centre before they are rounded."
         )
 
 
@@ -184,19 +210,21 @@ def check_switch(name: str, value: Any) -> None:
 
 
 def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:
-    """Raise unless a concrete `value` is a number, at least `least`, and whole (and no larger than numbers
-    of 32 bits) if so asked."""
+    """Raise unless a concrete `value` is one finite number, at least `least`, and whole (and no larger than
+    numbers of 32 bits) if so asked. True and False are no numbers."""
     if not is_concrete(value):
         return
     kind = "a whole number" if whole else "a number"
     try:
-        if isinstance(value, (str, bytes, bool)):
+        if isinstance(value, (str, bytes)) or np.ndim(value) or np.asarray(value).dtype.kind == "b":
             raise TypeError
         number = float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(f"{name} must be {kind}, but is {value!r}; pass {kind}.") from error
     if whole and number > LARGEST_COUNT:
         raise ValueError(f"{name} must be at most {LARGEST_COUNT}, but is {number:g}; lower it.")
+    if number == np.inf:
+        raise ValueError(f"{name} must be finite, but is {number:g}; lower it.")
     if not number >= least or (whole and number != int(number)):
         raise ValueError(f"{name} must be {kind} of at least {least:g}, but is {number:g}; raise it.")
 

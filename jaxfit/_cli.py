@@ -1,10 +1,12 @@
 """The command `jaxfit`: a file of points in, a fitted surface and a picture out."""
 
 import argparse
+import contextlib
 import importlib.util
 import math
 import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Sequence
@@ -14,12 +16,15 @@ from typing import Any
 import jax
 
 import jaxfit
-from jaxfit import io
+from jaxfit import _interrupt, io
 from jaxfit._checks import check_magnitude
 from jaxfit._cli_arguments import argument_parser
+from jaxfit._cli_cache import VARIABLE, cache_folder
 from jaxfit._cli_report import print_table, progress_bar
+from jaxfit._fit._summary import facts
 
-REACHED, NOT_REACHED, BAD_INPUT, FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+REACHED, NOT_REACHED, BAD_INPUT, FAILED = 0, 1, 2, 3
+INTERRUPTED = _interrupt.EXIT_CODE
 
 _PICTURES = (".png", ".pdf", ".svg", ".jpg")
 _LARGEST_INTERPOLATION = 40_000  # grid points, for --method auto
@@ -30,22 +35,30 @@ _TERRAIN_NET = (62, 57)
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (default: that of the process) and return its exit code.
 
-    Switches JAX to double precision unless told ``--float32``. What goes wrong is one sentence
-    on stderr; the codes are those in ``jaxfit fit --help``.
+    Switches JAX to double precision unless told ``--float32``, and has it keep compiled programs unless told
+    ``--no-cache``. What goes wrong is one sentence on stderr; the codes are those in ``jaxfit fit --help``.
+    With the process's own arguments it ends the process.
     """
+    code = _run(argv)
+    if argv is None:
+        # At once: taking the interpreter down costs a second, and crashes where a computation still runs.
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+    return code
+
+
+def _run(argv: Sequence[str] | None) -> int:
     started = time.perf_counter()
     try:
+        _interrupt.raise_again()
         args = argument_parser().parse_args(argv)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             return _fit_command(args, started)
     except KeyboardInterrupt:
-        _complain("interrupted, nothing more is written.", INTERRUPTED)
-        if argv is None:
-            # A computation may still be running, and taking the interpreter down under it crashes.
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        return INTERRUPTED
+        return _complain("interrupted, nothing more is written.", INTERRUPTED)
     except (ValueError, TypeError, OSError) as error:
         return _complain(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
@@ -60,7 +73,10 @@ def _complain(sentence: object, code: int) -> int:
 def _fit_command(args: argparse.Namespace, started: float) -> int:
     jax.config.update("jax_enable_x64", not args.float32)
     picture = _check_files(args)
+    _keep_programs(args)
     data = _read(args)
+    if picture:  # while the fit is compiled, which leaves Python idle
+        threading.Thread(target=_load_matplotlib, daemon=True).start()
     method = _choose_method(args, data)
     boundary = _choose_boundary(args, data) if method == "approximate" else None
     with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
@@ -82,18 +98,38 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
             {
                 "input": args.input,
                 "points": _describe(data),
-                "net": "{} x {}".format(*fit.surface.shape),
-                "order": "{} x {}".format(*fit.surface.order),
+                **facts(fit),
                 "method": f"{method}, {'single' if args.float32 else 'double'} precision",
-                "iterations": str(int(fit.stats["num_steps"])),
-                "average error": f"{100 * average:.4g} % of the diagonal",
-                "maximum error": f"{100 * maximum:.4g} % of the diagonal",
-                "stopped": fit.message,
                 "time": f"fit {seconds:.2f} s, total {total:.2f} s",
                 "written": ", ".join(str(path) for path in (args.output, picture) if path),
             }
         )
     return REACHED if _reached(args, method, fit, average, maximum) else NOT_REACHED
+
+
+def _keep_programs(args: argparse.Namespace) -> None:
+    """Have JAX keep what it compiles, where the user has not told JAX itself where to."""
+    kept_by_jax = getattr(jax.config, "jax_compilation_cache_dir", None)
+    if args.no_cache or (kept_by_jax and args.cache is None and VARIABLE not in os.environ):
+        return
+    try:
+        folder = cache_folder(args.cache)
+    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home folder
+        if not args.quiet:
+            print(
+                f"jaxfit: warning: compiled programs are not kept ({error}); give --cache DIR or --no-cache.",
+                file=sys.stderr,
+            )
+        return
+    if folder is not None:
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        # Small programs too: there are twenty of them, and each takes a tenth of a second.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _load_matplotlib() -> None:
+    import matplotlib.backends.backend_agg  # noqa: F401
 
 
 def _check_files(args: argparse.Namespace) -> str | None:
@@ -105,14 +141,15 @@ def _check_files(args: argparse.Namespace) -> str | None:
     if args.no_picture:
         return None
     drawable = importlib.util.find_spec("matplotlib") is not None
-    if args.picture is None:
-        return str(Path(args.output).with_suffix(".png")) if drawable else None
-    if not drawable:
+    if not drawable and args.picture is not None:
         raise io.InputError(
             "a picture needs Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
         )
-    io.check_output(args.picture, _PICTURES)
-    return args.picture
+    if not drawable:
+        return None
+    picture = args.picture or str(Path(args.output).with_suffix(".png"))
+    io.check_output(picture, _PICTURES)
+    return picture
 
 
 def _read(args: argparse.Namespace) -> io.PointData:

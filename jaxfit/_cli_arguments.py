@@ -26,6 +26,9 @@ exit codes:
   2  bad input or usage, or a file cannot be written
   3  the fit failed numerically, nothing is written
 
+environment:
+  JAXFIT_CACHE_DIR  as --cache; empty or "off" is --no-cache
+
 All errors are distances from the data to the surface, in % of the diagonal of the data's
 bounding box.
 """
@@ -72,6 +75,11 @@ def argument_parser() -> argparse.ArgumentParser:
     picture = fit.add_mutually_exclusive_group()
     picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
     picture.add_argument("--no-picture", action="store_true", help="draw nothing")
+    cache = fit.add_mutually_exclusive_group()
+    cache.add_argument(
+        "--cache", metavar="DIR", help="keep compiled programs there (default: the user's cache folder)"
+    )
+    cache.add_argument("--no-cache", action="store_true", help="keep no compiled programs")
     fit.add_argument("--float32", action="store_true", help="single precision")
     fit.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser

@@ -20,6 +20,7 @@ def folder(tmp_path, monkeypatch):
     np.savez(tmp_path / "cloud.npz", points=points, **sides)
     np.savez(tmp_path / "grid.npz", grid=wavy_grid(8, 7))
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
     return tmp_path
 
 

@@ -54,6 +54,7 @@ def folder(tmp_path, monkeypatch):
     np.savez(tmp_path / "grid.npz", grid=wavy_grid(8, 7))
     np.savetxt(tmp_path / "bare.xyz", points)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
     return tmp_path
 
 

@@ -9,7 +9,7 @@ from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._approximation._automatic_smoothing import Candidates
-from jaxfit._approximation._least_squares import StructuredSolver, posed
+from jaxfit._approximation._least_squares import StructuredSolver, least_squares_problem
 from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
 
@@ -80,7 +80,7 @@ def test_every_driver_finds_the_same_control_points(base, one, solver):
     @jax.jit
     def solved(pieces, net, u, v, points):
         system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
-        return solver(posed(system, EDGE, net))[0]
+        return solver(least_squares_problem(system, EDGE, net))[0]
 
     net = solved(pieces, base.control_points, feet.u, feet.v, POINTS)
     assert apart(one, np.asarray(net)) < 1e-8
@@ -93,7 +93,7 @@ def test_the_structured_solver_solves_with_the_jacobian_and_with_its_transpose(b
     @jax.jit
     def there_and_back(pieces, net, u, v, points, x):
         system = make_system(pieces, u, v, points.T, jnp.ones_like(u), jnp.asarray(SMOOTHING))
-        problem = posed(system, EDGE, net)
+        problem = least_squares_problem(system, EDGE, net)
         x = jnp.where(problem.normal.free[:, :, None], x, 0.0)
         image = jax.jvp(problem.residual, (net,), (x,))[1]
         solver = StructuredSolver(problem)

@@ -11,6 +11,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 
 # Lowest first; a room may import its own modules and those of the lines above it.
 ROOMS = [
+    ("_interrupt",),
     ("_checks",),
     ("_precision",),
     ("_barrier",),
@@ -25,7 +26,7 @@ ROOMS = [
     ("_approximation",),
     ("io",),
     ("plot",),
-    ("_cli_arguments", "_cli_report"),
+    ("_cli_arguments", "_cli_cache", "_cli_report"),
     ("_cli",),
     ("__main__",),
 ]

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from test_normal_matrices import surface_of, system_of
 
-from jaxfit._normal_equations import BlockCholesky, NormalOperator, Stencil, TensorCG, free_points
+from jaxfit._normal_equations import (
+    BlockCholesky,
+    NormalOperator,
+    Stencil,
+    TensorPreconditionedCG,
+    free_points,
+)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +39,7 @@ def solved(stencil, free, right):
     return lx.linear_solve(NormalOperator(stencil, free, right.shape[2]), right, BlockCholesky()).value
 
 
-@pytest.mark.parametrize("solver", [BlockCholesky(), TensorCG(rtol=1e-13)])
+@pytest.mark.parametrize("solver", [BlockCholesky(), TensorPreconditionedCG(rtol=1e-13)])
 def test_the_solution_is_that_of_the_dense_system(stencil, solver):
     free = ~held_of(stencil)
     right = np.random.default_rng(4).normal(size=(*free.shape, 3))

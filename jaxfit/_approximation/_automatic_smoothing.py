@@ -18,14 +18,13 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._least_squares import posed
+from jaxfit._approximation._least_squares import least_squares_problem
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
-from jaxfit._fit._method import Iterate
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import BlockCholesky, NormalOperator, System, free_points
+from jaxfit._normal_equations import BlockCholesky, NormalOperator, RegularisedSystem, free_points
 from jaxfit._splines._pieces import pieces_on
 
 DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same trace
@@ -128,7 +127,9 @@ def _check_counts(rule: Any) -> None:
 PROBES = 16
 
 
-def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int) -> Candidates:
+def evaluate_candidates(
+    system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int
+) -> Candidates:
     """All candidates, on the problem of improving `net`; one factorisation for each."""
     data, plate = system.data_stencil(), system.plate.stencil()
     free = free_points(data.plus(plate, 1.0), held)
@@ -138,9 +139,8 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     decades = jnp.asarray(np.linspace(*DECADES, count), net.dtype)
     smoothing = 10.0**decades * traces[0] / jnp.maximum(traces[1], tiny)
     residual = system.data_residual(net)
-    nothing = tuple(0.0 * x for x in system.plate.residual(net))
-    pull = jnp.where(mask, -system.adjoint((residual, (nothing[0], nothing[1], nothing[2]))), 0.0)
-    bend = jnp.where(mask, -plate(net), 0.0)
+    data_rhs = jnp.where(mask, -system.data_adjoint(residual), 0.0)
+    plate_rhs = jnp.where(mask, -plate(net), 0.0)
     signs = np.random.default_rng(0).integers(0, 2, (*net.shape[:2], PROBES)) * 2.0 - 1.0
     probes = jnp.where(mask, jnp.asarray(signs, net.dtype), 0.0)
     d = net.shape[2]
@@ -149,7 +149,7 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     def one(value: Array) -> tuple[Array, Array]:
         operator = NormalOperator(data.plus(plate, value), free, d + PROBES)
         solver = BlockCholesky()
-        right = jnp.concatenate([pull + value * bend, probes], axis=2)
+        right = jnp.concatenate([data_rhs + value * plate_rhs, probes], axis=2)
         solution, _, _ = solver.compute(solver.init(operator, {}), right, {})
         left = system.data_residual(net + solution[:, :, :d])
         across = left if normal is None else jnp.sum(normal * left, axis=0)
@@ -161,44 +161,41 @@ def tried(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
     return Candidates(smoothing, remaining, effective, points)
 
 
-def _normals(system: System, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
+def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:
     """Unit normals at the points' parameters; 0 where there is none."""
     pieces = pieces_on(net, system.axis_u, system.axis_v)
-    jet = evaluate_jet(row_coefficients(pieces, system.rows)[..., None], system.s, system.t)
+    jet = evaluate_jet(row_coefficients(pieces, system.rows), system.s, system.t)
     normal = jnp.cross(jet.s, jet.t, axis=0)
     square = jnp.sum(normal**2, axis=0)
     return normal * jnp.where(square > 0, lax.rsqrt(jnp.where(square > 0, square, 1.0)), 0.0)[None]
 
 
-def chosen(
+def select_smoothing(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:
     """The lambda for a fit that starts from a surface and its feet."""
     without = eqx.tree_at(lambda m: m.smoothing, method, 0.0)
-    return _chosen(rule, without, problem, surface, projection)
+    return _select(rule, without, problem, surface, projection)
 
 
 @partial(jax.jit, static_argnames=("rule", "method"))
-def _chosen(
+def _select(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:
     """Each round solves with the lambda it has found, and corrects the parameters."""
     held, diagonal = method.held(surface), problem.diagonal
-    first = jnp.asarray(True)
-    step = jnp.asarray(0, jnp.int32)
 
     def one(_: Any, carry: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
         net, here, _ = carry
         system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
-        candidates = tried(system, held, net, rule.candidates)
+        candidates = evaluate_candidates(system, held, net, rule.candidates)
         scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
         smoothing = rule.best(scaled)
         system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
-        net, _ = method.solver(posed(system, held, net))
-        here, _ = method.measure(problem, Iterate(surface.moved_to(net), here, (), step), first)
-        return net, here, smoothing
+        net, _ = method.solver(least_squares_problem(system, held, net))
+        return net, method.project(problem, surface.moved_to(net), here), smoothing
 
     rounds = rule.rounds if method.parameter_correction else 1
     net = surface.control_points
-    start = eqx.tree_at(lambda p: p.exact, projection, first)
+    start = eqx.tree_at(lambda p: p.exact, projection, jnp.asarray(True))
     return lax.fori_loop(0, rounds, one, (net, start, jnp.zeros((), net.dtype)))[2]

@@ -61,6 +61,7 @@ def _counted(points: Any, weight: Any) -> Any:
         counted = np.asarray(weight) > 0
         return points if counted.all() else np.asarray(points)[counted]
     # Of traced weights all points of weight 0 are taken to be where one that counts is.
+    points, weight = jnp.asarray(points), jnp.asarray(weight)
     first = points[jnp.argmax(weight > 0)]
     return jnp.where((weight > 0)[:, None], points, first[None])
 

@@ -40,7 +40,7 @@ from jaxfit._normal_equations import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
 
 
-class NormalRows(eqx.Module):
+class NormalEquations(eqx.Module):
     """A^T A and A^T e of the rows A = (Pi + mu (I - Pi))^(1/2) B, weighted."""
 
     matrix: CoupledStencil
@@ -49,17 +49,17 @@ class NormalRows(eqx.Module):
 
 class _Sums(eqx.Module):
     squares: Float[Array, "cells A Bp"]
-    pulls: Float[Array, "cells K Lc"]
+    right: Float[Array, "cells K Lc"]
 
 
-def normal_rows(
+def normal_equations(
     problem: Any,
     pieces: Pieces,
     u: Float[Array, " points"],
     v: Float[Array, " points"],
     weight: Float[Array, " points"],
     damping: Float[Array, ""],
-) -> NormalRows:
+) -> NormalEquations:
     """The normal equations at feet (u, v), for `damping` mu; points of weight 0 take no part."""
     pieces = jax.tree.map(jnp.asarray, pieces)
     rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), weight <= 0)
@@ -71,17 +71,17 @@ def normal_rows(
     def add(part: Rows, filled: Array, done: _Sums) -> _Sums:
         s, t, e, entries = materialise(always, _rows_at, pieces, part, part.spread(values), filled, damping)
         squares = row_moments(s, t, entries, 2 * order_u - 1, 2 * order_v - 1)
-        pulls = row_moments(s, t, e, order_u, order_v)
-        return _Sums(done.squares.at[part.cell].add(squares), done.pulls.at[part.cell].add(pulls))
+        right = row_moments(s, t, e, order_u, order_v)
+        return _Sums(done.squares.at[part.cell].add(squares), done.right.at[part.cell].add(right))
 
     begin = _Sums(
         jnp.zeros((pieces.cells, 2 * order_u - 1, (2 * order_v - 1) * pairs), u.dtype),
         jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype),
     )
     done = over_blocks(rows, add, begin)
-    matrix = coupled_stencil(done.squares, pieces.axis_u, pieces.axis_v, pairs)
-    gradient = cells_to_net(done.pulls, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
-    return NormalRows(matrix, gradient)
+    matrix = coupled_stencil(done.squares, pieces.axis_u, pieces.axis_v, d)
+    gradient = cells_to_net(done.right, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
+    return NormalEquations(matrix, gradient)
 
 
 def _rows_at(
@@ -90,7 +90,7 @@ def _rows_at(
     """Local coordinates, weighted residuals, and the entries of w (Pi + mu (I - Pi))."""
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    coefficients = row_coefficients(pieces, part)[..., None]
+    coefficients = row_coefficients(pieces, part)
     jet = materialise(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
     e = target - jet.value
     tangential = FreeTangents.at(pieces, u, v, e, jet).entries()

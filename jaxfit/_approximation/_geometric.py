@@ -9,23 +9,22 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._control_point_sums import Pulls, pull
+from jaxfit._approximation._control_point_sums import ControlPointSums, WeightedErrors
+from jaxfit._approximation._extrapolation import Extrapolation
 from jaxfit._approximation._fairing import Fairing
-from jaxfit._approximation._foot_updates import Follow, Stay
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._local_region import region_of
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, at_rest
-from jaxfit._approximation._sums_at_feet import pull_at_feet
 from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
-from jaxfit._closest import AbstractFootMethod, HuWallner, Newton
+from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._splines._pieces import Pieces
 
 
 class GeometricState(eqx.Module):
@@ -34,6 +33,7 @@ class GeometricState(eqx.Module):
     sums: Float[Any, "nu nv c"]
     momentum: Momentum | None
     exceeded: Bool[Any, " points"] | None  # points that are, or ever were, too far away
+    extrapolation: Extrapolation | None  # where converging feet start
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -121,10 +121,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             if getattr(self, name) is not None:
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_switches(self, ("foresee", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
@@ -153,63 +150,91 @@ class GeometricApproximation(AbstractIterativeMethod):
         xp: Any = np if is_concrete(net, projection) else jnp
         sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
         momentum = None if self.acceleration is None else at_rest(net)
-        return surface, GeometricState(sums, momentum, projection.converged if self.local else None)
+        extrapolation = Extrapolation.none(projection.u) if self._extrapolates else None
+        exceeded = projection.converged if self.local else None
+        return surface, GeometricState(sums, momentum, exceeded, extrapolation)
+
+    @property
+    def _extrapolates(self) -> bool:
+        """Feet that converge start ahead, unless weights follow from errors and need them where feet are."""
+        return not self.foresee and self.loss is None
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
         """Feet from the last ones, converged on the new surface or one step on, and the sums there."""
         state: GeometricState = iterate.state
         pieces, before = iterate.surface.pieces, iterate.projection
-        idle = ~jnp.asarray(problem.real)
-        resting = idle
+        resting = ~jnp.asarray(problem.real)
+        touched = None
         if self.local:
             assert state.exceeded is not None
             region = region_of(pieces, before.u, before.v, state.exceeded)
-            resting = idle | (~region.alive & ~exact)
-
-        def converged(feet: Projection) -> Projection:
-            # The safeguard keeps the best foot there is, and the final check looks again: no borders here.
-            new = measure_feet(
-                self.foot_method, problem, pieces, feet, self.foot_tolerance, resting, borders=False
-            )
-            return eqx.tree_at(lambda m: m.error, new, jnp.where(resting, feet.error, new.error))
-
-        here = before
-        if self.loss is not None:  # weights follow from errors, so these come first
-            here = lax.cond(exact, converged, lambda m: m, here) if self.foresee else converged(here)
-        # Where residuals are foreseen in the pass itself, those before it give the scale.
-        weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, here.error))
-
-        def at_feet() -> tuple[Projection, Pulls, Array]:
-            return pull_at_feet(
-                self.foot_method, problem, pieces, before, self.foot_tolerance, resting, weigh
-            )
-
-        def one_pass() -> tuple[Projection, Pulls, Array]:
-            tolerance = self.foot_tolerance * problem.diagonal
-            move = Follow(self.foot_method, tolerance) if self.foresee else Stay()
-            pulled = pull(problem, pieces, here.u, here.v, here.error, resting, weigh, move)
-            u, v, error = jnp.where(exact, jnp.stack([here.u, here.v, here.error]), pulled.feet)
-            steps = jnp.where(exact, here.evaluations, 1) if self.foresee else here.evaluations
-            feet = Projection(u, v, error, steps, here.converged, pulled.active, jnp.asarray(True))
-            return feet, pulled.pulls, pulled.active
-
-        if self.loss is not None:
-            here, pulls, active = one_pass()
-        elif self.foresee:
-            here, pulls, active = lax.cond(exact, at_feet, one_pass)
-        else:
-            here, pulls, active = at_feet()
-        sums, exceeded = pulls.sums, state.exceeded
+            resting, touched = resting | (~region.alive & ~exact), region.touched
+        feet, sums = self._feet(problem, pieces, state, before, resting, exact)
+        error = jnp.where(resting, before.error, feet.error)
+        extrapolation = state.extrapolation
+        if extrapolation is not None:
+            extrapolation = extrapolation.after(jnp.stack([feet.u - before.u, feet.v - before.v]))
+        weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
+        active = jnp.sum((weight > 0) & ~resting, dtype=jnp.int32)
+        exceeded = state.exceeded
         if self.local:
-            errors = jnp.where(problem.counted, here.error, 0.0) / problem.diagonal
+            errors = jnp.where(problem.counted, error, 0.0) / problem.diagonal
             exceeded = exceeded | (errors > _threshold(problem, jnp.max(errors)))
             # Sums are complete where all points were looked at, or those that feel what was touched before.
-            after = region_of(pieces, here.u, here.v, exceeded)
-            touched = jnp.where(exact, after.touched, region.touched)
-            sums = jnp.where(touched[..., None], sums, 0.0)
+            after = region_of(pieces, feet.u, feet.v, exceeded)
+            complete = jnp.where(exact, after.touched, touched)
+            sums = jnp.where(complete[..., None], sums, 0.0)
         certain = exact | (not self.foresee)
-        here = eqx.tree_at(lambda p: (p.active, p.exact), here, (active, certain))
-        return here, GeometricState(sums, state.momentum, exceeded)
+        converged = jnp.where(certain, feet.converged, before.converged)
+        here = Projection(feet.u, feet.v, error, feet.evaluations, converged, active, certain)
+        return here, GeometricState(sums, state.momentum, exceeded, extrapolation)
+
+    def _feet(
+        self,
+        problem: Problem,
+        pieces: Pieces,
+        state: GeometricState,
+        before: Projection,
+        resting: Bool[Array, " points"],
+        exact: Array,
+    ) -> tuple[FootUpdate, Float[Array, "nu nv c"]]:
+        """Feet and sums. A loss weighs points by the errors of the iteration before; where these are not at
+        feet, or there are none, points are looked at twice.
+        """
+        u, v = before.u, before.v
+        if state.extrapolation is not None:
+            u, v = state.extrapolation.predict((pieces.axis_u, pieces.axis_v), u, v)
+
+        def update(u: Array, v: Array, error: Array) -> tuple[FootUpdate, WeightedErrors]:
+            weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, error))
+            return update_feet(
+                self.foot_method,
+                pieces,
+                problem.target,
+                u,
+                v,
+                self.foot_tolerance * problem.diagonal,
+                idle=resting,
+                single_step=~exact if self.foresee else False,
+                sums=ControlPointSums(None if self.loss is None else weigh),
+                weight=problem.weight,
+            )
+
+        if self.loss is None:
+            feet, sums = update(u, v, before.error)
+            return feet, sums.sums
+
+        def again(carry: Any) -> Any:
+            number, feet, _ = carry
+            new, sums = update(feet.u, feet.v, feet.error)
+            steps = jnp.where((number > 0) & certain, feet.evaluations, new.evaluations)
+            return number + 1, eqx.tree_at(lambda f: f.evaluations, new, steps), sums.sums
+
+        certain = exact | (not self.foresee)
+        first = FootUpdate(u, v, before.error, before.evaluations, before.converged)
+        begin = (jnp.where(certain, 0, 1), first, state.sums)
+        _, feet, total = lax.while_loop(lambda carry: carry[0] < 2, again, begin)
+        return feet, total
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new one, always."""
@@ -220,7 +245,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         surface, state, step = iterate.surface, iterate.state, iterate.step + 1
         net, momentum = surface.control_points, state.momentum
         held = held_points(self.border, net.shape, surface.used)
-        reached = jnp.where(held[..., None], net, net + self.relaxation * Pulls(state.sums).means)
+        reached = jnp.where(held[..., None], net, net + self.relaxation * WeightedErrors(state.sums).means)
         changes = [x.every for x in (self.fairing, self.insertion) if x is not None]
         changed = jnp.any(step % np.asarray(changes, np.int32) == 0)
         moved = reached
@@ -236,7 +261,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         if momentum is not None:
             rest = at_rest(surface.control_points)
             momentum = lax.cond(changed, lambda: rest, lambda: momentum)
-        state = GeometricState(state.sums, momentum, state.exceeded)
+        state = GeometricState(state.sums, momentum, state.exceeded, state.extrapolation)
         return Iterate(surface, iterate.projection, state, step), history
 
     def postprocess(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._least_squares import AbstractLeastSquares, Posed
+from jaxfit._approximation._least_squares import AbstractLeastSquares, LeastSquaresProblem
 
 
 class JaxoptGaussNewton(AbstractLeastSquares):
@@ -24,7 +24,7 @@ class JaxoptGaussNewton(AbstractLeastSquares):
     tolerance: float = 1e-10
     max_steps: int = 20
 
-    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """As many steps as it takes."""
         return _minimised("GaussNewton", problem, self.tolerance, self.max_steps)
 
@@ -43,12 +43,12 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
     tolerance: float = 1e-11
     max_steps: int = 60
 
-    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """As many steps as it takes."""
         return _minimised("LevenbergMarquardt", problem, self.tolerance, self.max_steps)
 
 
-def _minimised(name: str, problem: Posed, tolerance: float, steps: int) -> tuple[Array, Array]:
+def _minimised(name: str, problem: LeastSquaresProblem, tolerance: float, steps: int) -> tuple[Array, Array]:
     """Runs jaxopt's driver of this name on the residual as one vector of the control points as one vector."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says at import that it is not maintained

@@ -16,13 +16,13 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
-from jaxfit._normal_equations import NormalOperator, Stencil, System, free_points, normal_solver
+from jaxfit._normal_equations import NormalOperator, RegularisedSystem, Stencil, free_points, normal_solver
 
 
-class Posed(eqx.Module):
+class LeastSquaresProblem(eqx.Module):
     """A system with its normal matrix on the free control points; the others are as in `net`."""
 
-    system: System
+    system: RegularisedSystem
     normal: NormalOperator
     net: Float[Array, "nu nv d"]
 
@@ -31,22 +31,24 @@ class Posed(eqx.Module):
         return self.system.residual(jnp.where(self.normal.free[:, :, None], net, self.net))
 
 
-def posed(system: System, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]) -> Posed:
+def least_squares_problem(
+    system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
+) -> LeastSquaresProblem:
     """The problem of improving `net`, whose control points `held` stay."""
 
-    def matrix(system: System) -> tuple[Stencil, Array]:
+    def matrix(system: RegularisedSystem) -> tuple[Stencil, Array]:
         stencil = system.stencil()
         return stencil, free_points(stencil, held)
 
     stencil, free = materialise(system.root[0, 0] >= 0, matrix, system)
-    return Posed(system, NormalOperator(stencil, free, net.shape[2]), net)
+    return LeastSquaresProblem(system, NormalOperator(stencil, free, net.shape[2]), net)
 
 
 class AbstractLeastSquares(eqx.Module):
     """A way to solve a linear least-squares problem from a net near the solution."""
 
     @abstractmethod
-    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """The net of least squares, and by what share of its diagonal a singular matrix was shifted."""
 
 
@@ -57,7 +59,7 @@ class GaussNewton(AbstractLeastSquares):
     factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
     """
 
-    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """One step."""
         import optimistix as optx
 
@@ -65,7 +67,7 @@ class GaussNewton(AbstractLeastSquares):
         # The residual is linear, so the first step is the solution: nothing is measured to tell whether it is
         # the last, and it is not evaluated just to be accepted.
         solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
-        return _freed(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
+        return _free_part(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
 
 
 class LevenbergMarquardt(AbstractLeastSquares):
@@ -85,7 +87,7 @@ class LevenbergMarquardt(AbstractLeastSquares):
     tolerance: float = 1e-10
     max_steps: int = 60
 
-    def __call__(self, problem: Posed) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """As many steps as it takes."""
         import optimistix as optx
 
@@ -94,21 +96,21 @@ class LevenbergMarquardt(AbstractLeastSquares):
         tolerance = max(self.tolerance, 10 * eps)
         solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
         net = _solution(solver, problem, self.max_steps).value
-        return _freed(problem, net), jnp.zeros((), net.dtype)
+        return _free_part(problem, net), jnp.zeros((), net.dtype)
 
 
-def _solution(solver: Any, problem: Posed, steps: int) -> Any:
+def _solution(solver: Any, problem: LeastSquaresProblem, steps: int) -> Any:
     import optimistix as optx
 
     # Of what it is linearised at, the driver stores the arguments instead of a dozen arrays over the points.
     @partial(jax.checkpoint, prevent_cse=False)
-    def residual(net: Array, problem: Posed) -> Any:
+    def residual(net: Array, problem: LeastSquaresProblem) -> Any:
         return problem.residual(net)
 
     return optx.least_squares(residual, solver, problem.net, problem, max_steps=steps, throw=False)
 
 
-def _freed(problem: Posed, net: Array) -> Array:
+def _free_part(problem: LeastSquaresProblem, net: Array) -> Array:
     """The free control points of `net`, and the others as they were."""
     return jnp.where(problem.normal.free[:, :, None], net, problem.net)
 
@@ -120,7 +122,7 @@ class StructuredSolver(lx.AbstractLinearSolver):
     the driver hands over nothing is asked.
     """
 
-    problem: Posed
+    problem: LeastSquaresProblem
     state: Any
 
     class Side(eqx.Module):
@@ -128,7 +130,7 @@ class StructuredSolver(lx.AbstractLinearSolver):
 
         transposed: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, problem: Posed) -> None:
+    def __init__(self, problem: LeastSquaresProblem) -> None:
         self.problem = problem
         self.state = self._solver.init(problem.normal, {})
 

@@ -1,13 +1,12 @@
 """Orthogonal distance: Gauss-Newton on the true distances, with the feet eliminated."""
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxfit._approximation._damping import (
     DampingState,
@@ -15,12 +14,12 @@ from jaxfit._approximation._damping import (
     first_damping,
     is_plausible,
     next_damping,
-    within_reach,
 )
-from jaxfit._approximation._distance_rows import NormalRows, normal_rows
+from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
-from jaxfit._approximation._second_order import second_order_pull
+from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_kind, check_number
@@ -28,16 +27,12 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import Stencil, coupled_cg, free_points, preconditioner, thin_plate
-from jaxfit._splines._pieces import Axis, pieces_on
-
-RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
-MOST_STEPS = 60  # of conjugate gradients
-LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
+from jaxfit._normal_equations import thin_plate
+from jaxfit._splines._pieces import pieces_on
 
 
 class OrthogonalState(eqx.Module):
@@ -137,10 +132,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_number("damping", self.damping, 0.0)
         if not 0 < self.damping <= 1:
             raise ValueError(
@@ -171,15 +163,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
         """Feet from the last accepted ones, and the energy of the surface."""
         surface, state = iterate.surface, iterate.state
-        idle = ~jnp.asarray(problem.real)
         here = measure_feet(
-            self.foot_method,
-            problem,
-            surface.pieces,
-            iterate.projection,
-            self.foot_tolerance,
-            idle,
-            borders=False,
+            self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
         )
         energy = state.smoothing * thin_plate(*surface.axes).energy(surface.control_points)
         return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
@@ -219,18 +204,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
         held = held_points(self.border, net.shape, surface.used)
         always = problem.diagonal > 0
         feet = (here.u, here.v, weight)
-        rows = materialise(
+        equations = materialise(
             always,
-            lambda net, *x: normal_rows(problem, pieces_on(net, *axes), *x),
+            lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
             *(net, *feet, damping.damping),
         )
 
-        def bends(net: Array, move: Array) -> Array:
+        def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
-            return materialise(always, partial(second_order_pull, problem), pieces, moves, *feet)
+            return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
-        solve = partial(_stepped, axes, iterate.state.smoothing, self.reach, bends)
-        following, predicted = materialise(always, solve, rows, net, held, damping.damping)
+        solve = partial(gauss_newton_step, axes, iterate.state.smoothing, self.reach, correction_rhs)
+        following, predicted = materialise(always, solve, equations, net, held, damping.damping)
         judged = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
         state = OrthogonalState(iterate.state.smoothing, judged)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
@@ -256,42 +241,3 @@ class OrthogonalDistance(AbstractIterativeMethod):
             "damping": state.damping.damping,
             "rejected_steps": state.damping.rejected_steps,
         }
-
-
-def _stepped(
-    axes: tuple[Axis, Axis],
-    smoothing: Any,
-    reach: Any,
-    bends: Callable[[Array, Array], Array],
-    rows: NormalRows,
-    net: Float[Array, "nu nv d"],
-    held: Bool[Array, "nu nv"],
-    damping: Float[Array, ""],
-) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-    """The net after the step, and by how much the objective should fall."""
-    plate = thin_plate(*axes)
-    stiffness = plate.stencil()
-    matrix = rows.matrix.plus(stiffness, smoothing)
-    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
-    scale = 1.0 + (net.shape[2] - 1) * damping
-    uncoupled = Stencil(rows.matrix.trace.entries / scale).plus(stiffness, smoothing)
-    free = free_points(uncoupled, held)
-    right = rows.gradient - smoothing * plate.adjoint(plate.residual(net))
-    right = jnp.where(free[:, :, None], right, 0.0)
-    near = preconditioner(matrix, uncoupled, free)
-    move = coupled_cg(matrix, right, free, near, RESIDUAL, MOST_STEPS)
-    move = jnp.where(damping < 1, within_reach(net, move, reach), move)
-    foreseen = jnp.sum(move * (2.0 * right - matrix(move)))
-
-    def corrected() -> Array:
-        bent = jnp.where(free[:, :, None], bends(net, move), 0.0)
-        second = coupled_cg(matrix, bent, free, near, RESIDUAL, MOST_STEPS)
-        return within_reach(net, move + _at_most(LARGEST_CORRECTION, second, move), reach)
-
-    return net + lax.cond(damping < 1, corrected, lambda: move), foreseen
-
-
-def _at_most(share: float, correction: Array, move: Array) -> Array:
-    """The correction, no longer than a share of the move."""
-    length, most = jnp.sqrt(jnp.sum(correction**2)), share * jnp.sqrt(jnp.sum(move**2))
-    return jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0) * correction

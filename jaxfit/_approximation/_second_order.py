@@ -33,10 +33,10 @@ from jaxfit._cells import (
 from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
 
-NEAR = 0.5  # the share of the first form that must be left in the Hessian
+LEAST_SHARE = 0.5  # the share of the first form that must be left in the Hessian
 
 
-def second_order_pull(
+def second_order_rhs(
     problem: Any,
     pieces: Pieces,
     moves: Pieces,
@@ -54,33 +54,35 @@ def second_order_pull(
     values = jnp.concatenate([problem.target, jnp.stack([u, v, weight])])
 
     def add(part: Rows, filled: Array, total: Array) -> Array:
-        s, t, bent = materialise(always, _bent_at, pieces, moves, part, part.spread(values), filled)
-        return total.at[part.cell].add(row_moments(s, t, bent, order_u, order_v))
+        s, t, second = materialise(
+            always, _second_derivative_at, pieces, moves, part, part.spread(values), filled
+        )
+        return total.at[part.cell].add(row_moments(s, t, second, order_u, order_v))
 
     begin = jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype)
     total = over_blocks(rows, add, begin)
     return cells_to_net(total, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
 
 
-def _bent_at(
+def _second_derivative_at(
     pieces: Pieces, moves: Pieces, part: Rows, here: Array, filled: Array
 ) -> tuple[Array, Array, Array]:
     """Local coordinates, and -w / 2 times the second derivative of the normal part of the residual."""
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     always = u[0, 0] >= pieces.axis_u.breaks[0]
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
-    jet = materialise(always, evaluate_jet, row_coefficients(pieces, part)[..., None], s, t)
-    coefficients = row_coefficients(moves, part)[..., None]
+    jet = materialise(always, evaluate_jet, row_coefficients(pieces, part), s, t)
+    coefficients = row_coefficients(moves, part)
     value, value_s, value_t = materialise(always, lambda *x: evaluate_jet(*x)[:3], coefficients, s, t)
     e = target - jet.value
     free = FreeTangents.at(pieces, u, v, e, jet)
     along = free.coordinates(value)
     pull = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
-    slide, near = _slide(free, e, jet, along, pull)
+    slide, valid = _slide(free, e, jet, along, pull)
     (ms, mt), (ds, dt) = ([x[None] for x in pair] for pair in (along, slide))
-    bent = value_s * (ds - ms) + value_t * (dt - mt)
-    bent -= jet.ss * ms * ds + jet.st * (ms * dt + mt * ds) + jet.tt * mt * dt
-    return s, t, jnp.where(near[None], -0.5 * weight[None] * free.normal(bent), 0.0)
+    second = value_s * (ds - ms) + value_t * (dt - mt)
+    second -= jet.ss * ms * ds + jet.st * (ms * dt + mt * ds) + jet.tt * mt * dt
+    return s, t, jnp.where(valid[None], -0.5 * weight[None] * free.normal(second), 0.0)
 
 
 def _slide(
@@ -93,8 +95,8 @@ def _slide(
     E, F, G = dot(jet.s, jet.s), dot(jet.s, jet.t), dot(jet.t, jet.t)
     a, b, c = E - dot(e, jet.ss), F - dot(e, jet.st), G - dot(e, jet.tt)
     determinant = a * c - b * b
-    near = (a > NEAR * E) & (determinant > NEAR**2 * (E * G - F * F))
-    both = near & (free.per_first > 0) & (free.per_second > 0)
+    valid = (a > LEAST_SHARE * E) & (determinant > LEAST_SHARE**2 * (E * G - F * F))
+    both = valid & (free.per_first > 0) & (free.per_second > 0)
     inverse = 1.0 / jnp.where(both, determinant, 1.0)
     ds, dt = (c * pull[0] - b * pull[1]) * inverse, (a * pull[1] - b * pull[0]) * inverse
-    return (jnp.where(both, ds, -along[0]), jnp.where(both, dt, -along[1])), near
+    return (jnp.where(both, ds, -along[0]), jnp.where(both, dt, -along[1])), valid

@@ -8,22 +8,22 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, chosen
+from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select_smoothing
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
-from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, posed
+from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
+from jaxfit._checks import check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import measure_feet
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import System, make_system, thin_plate
+from jaxfit._normal_equations import RegularisedSystem, make_system, thin_plate
 
 
 class StandardState(eqx.Module):
@@ -101,10 +101,7 @@ class StandardApproximation(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
-        check_kind("foot_method", self.foot_method, AbstractFootMethod, "Newton()")
-        check_number("foot_tolerance", self.foot_tolerance, 0.0)
-        check_number("stall_window", self.stall_window, 1, whole=True)
-        check_number("stall_gain", self.stall_gain, 0.0)
+        check_method(self)
         check_switches(self, ("parameter_correction",))
 
     @property
@@ -122,7 +119,7 @@ class StandardApproximation(AbstractIterativeMethod):
     ) -> tuple[WorkingSurface, StandardState]:
         """lambda as given, or chosen from the data."""
         if isinstance(self.smoothing, AbstractSmoothing):
-            smoothing = chosen(self.smoothing, self, problem, surface, projection)
+            smoothing = select_smoothing(self.smoothing, self, problem, surface, projection)
         else:
             smoothing = as_smoothing(self.smoothing, problem.target.dtype)
         xp: Any = np if is_concrete(problem, smoothing) else jnp
@@ -135,27 +132,26 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def system(
         self, problem: Problem, surface: WorkingSurface, projection: Projection, smoothing: Any
-    ) -> System:
+    ) -> RegularisedSystem:
         """The least-squares problem at the present parameters."""
         length = loss_length(self.loss, problem, projection.error)
         weight = reweighted(self.loss, length, problem.weight, projection.error)
         parameters = projection.u, projection.v
         return make_system(surface.pieces, *parameters, problem.target, weight, smoothing)
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
+    def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
         """New parameters, or the errors at the old ones."""
-        pieces, before = iterate.surface.pieces, iterate.projection
-        idle = ~jnp.asarray(problem.real)
         if self.parameter_correction:
-            here = measure_feet(
-                self.foot_method, problem, pieces, before, self.foot_tolerance, idle, borders=False
-            )
-            return here, iterate.state
-        error = values_at(pieces, before.u, before.v) - problem.target
+            return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
+        idle = ~jnp.asarray(problem.real)
+        error = values_at(surface.pieces, before.u, before.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
         active = jnp.sum(problem.counted, dtype=jnp.int32)
-        here = Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
-        return here, iterate.state
+        return Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
+        """Feet, or the errors at held parameters."""
+        return self.project(problem, iterate.surface, iterate.projection), iterate.state
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new one, always."""
@@ -165,7 +161,7 @@ class StandardApproximation(AbstractIterativeMethod):
         """The net of least squares at the present parameters, and new knots."""
         surface, here, state = iterate.surface, iterate.projection, iterate.state
         system = self.system(problem, surface, here, state.smoothing)
-        net, shift = self.solver(posed(system, self.held(surface), surface.control_points))
+        net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
         surface, step = surface.moved_to(net), iterate.step + 1
         if self.insertion is not None:
             surface = self.insertion(step, surface, here, problem.counted)

@@ -6,6 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base._boundary import Boundary, farthest, frame
+from jaxfit._base._boundary_check import check_same_place
 from jaxfit._base._cloud import Cloud, cloud_of
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
@@ -75,7 +76,8 @@ def base_surface(
     ------
     ValueError
         For a net smaller than the order, an order outside 2 to 8, a tolerance that is not
-        positive, points of another dimension; a method that needs points without them.
+        positive, points of another dimension, a cloud far from its boundary or a hundred times as large or
+        small; a method that needs points without them.
     TypeError
         For a boundary traced by `jit`: which vertices are kept depends on their values.
 
@@ -95,6 +97,8 @@ def base_surface(
     dtype, dimension = sides[0].dtype, sides[0].shape[1]
     clouds = [] if points is None else [np.asarray(as_points("points", points, dimension))]
     _check_cloud(method, clouds, points)
+    for cloud in clouds:
+        check_same_place(cloud, boundary)
     # Centred and of size one, so that neither units nor coordinates in the millions matter.
     centre, size = frame(sides)
     lines = [(x.astype(float) - centre) / size for x in sides]

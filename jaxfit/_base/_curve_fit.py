@@ -165,7 +165,7 @@ def _located(
 ) -> tuple[_Feet, list[Array]]:
     first, weights = spans_and_weights(problem.knots, order, u, (0, *derivatives), False)
     touched = first[:, None] + jnp.arange(order)[None, :]
-    basis = [jnp.stack(w, axis=-1) for w in weights]
+    basis = weights.swapaxes(1, 2)
     # Sums, not matrix products, which accelerators may round to fewer digits.
     values = [jnp.sum(b[..., None] * control[touched], axis=1) for b in basis]
     return _Feet(u, touched, basis[0], problem.points - values[0]), values[1:]

@@ -2,24 +2,18 @@
 
 from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
 from jaxfit._cells._blocks import over_blocks as over_blocks
-from jaxfit._cells._few import few_among as few_among
-from jaxfit._cells._few import few_of as few_of
-from jaxfit._cells._few import rows_of_few as rows_of_few
-from jaxfit._cells._kept_rows import KeptRows as KeptRows
 from jaxfit._cells._layout import cells_of as cells_of
-from jaxfit._cells._layout import in_line as in_line
-from jaxfit._cells._layout import in_rows as in_rows
-from jaxfit._cells._layout import jet_in_line as jet_in_line
 from jaxfit._cells._layout import local_coordinates as local_coordinates
 from jaxfit._cells._layout import row_coefficients as row_coefficients
 from jaxfit._cells._layout import rows_of as rows_of
+from jaxfit._cells._layout import take as take
 from jaxfit._cells._layout import values_at as values_at
+from jaxfit._cells._overlap import overlap_add as overlap_add
 from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
 from jaxfit._cells._polynomials import horner as horner
-from jaxfit._cells._polynomials import jet_along_rows as jet_along_rows
-from jaxfit._cells._polynomials import values_along_rows as values_along_rows
+from jaxfit._cells._polynomials import powers as powers
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows
 from jaxfit._cells._rows import make_single_rows as make_single_rows

@@ -4,12 +4,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int, Shaped
 
-from jaxfit._barrier import materialise
-from jaxfit._cells._polynomials import Jet, evaluate_jet, horner
+from jaxfit._cells._polynomials import PARTIALS, polynomial_partials
 from jaxfit._cells._rows import Rows, make_rows
 from jaxfit._splines._pieces import Pieces
 
@@ -30,37 +28,15 @@ def rows_of(
     return make_rows(jnp.where(left_out, pieces.cells, cells_of(pieces, u, v)), pieces.cells, width)
 
 
-def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "d K L rows"]:
+def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "rows d K L"]:
     """Every row's polynomial."""
-    return jnp.moveaxis(pieces.coefficients[rows.cell], 0, -1)
+    return take(pieces.coefficients, rows.cell, 0)
 
 
-def in_line(x: Shaped[Array, "*before rows width"]) -> Shaped[Array, "*before slots"]:
-    """All slots of all rows side by side, for vector loops that are not as short as a row."""
-    return x.reshape(*x.shape[:-2], -1)
-
-
-def in_rows(x: Shaped[Array, "*before slots"], rows: int) -> Shaped[Array, "*before rows width"]:
-    """Slots in their rows again, where something belongs to a row."""
-    return x.reshape(*x.shape[:-1], rows, -1)
-
-
-def jet_in_line(
-    always: Array,
-    coefficients: Float[Array, "d K L rows"],
-    s: Float[Array, " slots"],
-    t: Float[Array, " slots"],
-) -> Jet:
-    """Value and derivatives in every slot, each evaluated once (`materialise`)."""
-    rows = coefficients.shape[-1]
-    jet = materialise(
-        always,
-        lambda c, s, t: evaluate_jet(c[..., None], s, t),
-        coefficients,
-        in_rows(s, rows),
-        in_rows(t, rows),
-    )
-    return Jet(*(in_line(x) for x in jet))
+def take(x: Shaped[Array, "..."], index: Int[Array, "..."], axis: int) -> Shaped[Array, "..."]:
+    """Entries along an axis, given by numbers that are known to be within bounds."""
+    at = (slice(None),) * axis + (index,)
+    return jnp.asarray(x).at[at].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def local_coordinates(
@@ -69,8 +45,8 @@ def local_coordinates(
     """Coordinates in [-1, 1]^2 of parameters, within cells given by number."""
     axis_u, axis_v = pieces.axis_u, pieces.axis_v
     cell_u, cell_v = cell // axis_v.cells, cell % axis_v.cells
-    s = (u - axis_u.centre[cell_u]) / axis_u.half[cell_u]
-    return s, (v - axis_v.centre[cell_v]) / axis_v.half[cell_v]
+    middle_u, middle_v = take(axis_u.bounds[2:], cell_u, 1), take(axis_v.bounds[2:], cell_v, 1)
+    return (u - middle_u[0]) / middle_u[1], (v - middle_v[0]) / middle_v[1]
 
 
 def values_at(
@@ -84,10 +60,8 @@ def values_at(
     d, order_u, order_v = pieces.coefficients.shape[1:]
     cell = cells_of(pieces, u, v)
     s, t = local_coordinates(pieces, cell, u, v)
-    flat, first = pieces.coefficients.reshape(-1), cell * (d * order_u * order_v)
-    number = np.arange(d * order_u * order_v).reshape(d, order_u, order_v)
-    values = []
-    for coordinate in number:
-        rows = [horner([flat[first + int(i)] for i in row], t, 0) for row in coordinate]
-        values.append(horner(rows, s, 0))
-    return jnp.stack(values)
+    terms = order_u * order_v
+    number = jnp.arange(d * terms, dtype=cell.dtype).reshape(d, terms).T[..., None]
+    flat = take(pieces.coefficients.reshape(-1), cell[None, None] * (d * terms) + number, 0)
+    each = [x[0] for x in lax.split(flat, (1,) * terms)]
+    return polynomial_partials(each, order_v, s[None], t[None], PARTIALS[:1])[0]

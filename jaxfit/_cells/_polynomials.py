@@ -1,14 +1,14 @@
 """Evaluating polynomial pieces with their derivatives, by Horner's rule."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
-Coefficient = Callable[[int, int], Array]  # of s^a t^b, of all coordinates
+PARTIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # orders of the derivatives in a jet
 
 
 class Jet(NamedTuple):
@@ -23,66 +23,59 @@ class Jet(NamedTuple):
 
 
 def evaluate_jet(
-    coefficients: Float[Array, "d K L ..."], s: Float[Array, "..."], t: Float[Array, "..."]
+    coefficients: Float[Array, "rows d K L"], s: Float[Array, "rows width"], t: Float[Array, "rows width"]
 ) -> Jet:
-    """Value and all derivatives up to order two.
-
-    `coefficients` broadcasts against `s` and `t`: one value per row for points in rows, one per point
-    elsewhere. Each derivative is a rule of its own: as vector loops over points, six short ones compile and
-    run faster than one that shares everything.
-    """
-    return _jet(lambda a, b: coefficients[:, a, b], coefficients.shape[:3], s, t)
+    """Value and all derivatives up to order two, of one polynomial a row."""
+    return Jet(*_along_rows(coefficients, s, t, PARTIALS))
 
 
 def evaluate_values(
-    coefficients: Float[Array, "d K L ..."], s: Float[Array, "..."], t: Float[Array, "..."]
-) -> Float[Array, "d ..."]:
-    """The value alone."""
-    return _partial(lambda a, b: coefficients[:, a, b], coefficients.shape[:3], s, t, 0, 0)
-
-
-def jet_along_rows(
-    coefficients: Float[Array, "rows d K L"], s: Float[Array, "rows width"], t: Float[Array, "rows width"]
-) -> Jet:
-    """`evaluate_jet` for rows whose coefficients lie side by side, as they are fetched: to lay them out
-    otherwise would be a copy.
-    """
-    return _jet(*_of_rows(coefficients), s, t)
-
-
-def values_along_rows(
     coefficients: Float[Array, "rows d K L"], s: Float[Array, "rows width"], t: Float[Array, "rows width"]
 ) -> Float[Array, "d rows width"]:
     """The value alone."""
-    return _partial(*_of_rows(coefficients), s, t, 0, 0)
+    return _along_rows(coefficients, s, t, PARTIALS[:1])[0]
 
 
-def _of_rows(coefficients: Array) -> tuple[Coefficient, tuple[int, ...]]:
-    return lambda a, b: coefficients[:, :, a, b].T[..., None], coefficients.shape[1:]
+def _along_rows(coefficients: Array, s: Array, t: Array, partials: Sequence[tuple[int, int]]) -> list[Array]:
+    # Each derivative is a rule of its own, from the coefficients: that takes fewer instructions than
+    # rules that share intermediate results, which would have to be stored.
+    rows, d, order_u, order_v = coefficients.shape
+    flat = coefficients.reshape(rows, d, order_u * order_v).transpose(1, 0, 2)
+    return polynomial_partials(
+        lax.split(flat, (1,) * (order_u * order_v), 2), order_v, s[None], t[None], partials
+    )
 
 
-def _jet(c: Coefficient, shape: tuple[int, ...], s: Array, t: Array) -> Jet:
-    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    return Jet(*(_partial(c, shape, s, t, i, j) for i, j in orders))
+def polynomial_partials(
+    coefficients: Sequence[Array],
+    order_v: int,
+    s: Float[Array, "1 ..."],
+    t: Float[Array, "1 ..."],
+    partials: Sequence[tuple[int, int]],
+) -> list[Array]:
+    """Derivatives of sum_ab c_ab s^a t^b; the coefficients are in row-major order and broadcast against s."""
+    rows = [coefficients[k : k + order_v] for k in range(0, len(coefficients), order_v)]
+    everywhere = jnp.broadcast_shapes(coefficients[0].shape, s.shape)
+    found = (horner([horner(row, t, j) for row in rows[i:]], s, i, i) for i, j in partials)
+    return [x if x.shape == everywhere else jnp.broadcast_to(x, everywhere) for x in found]
 
 
-def _partial(c: Coefficient, shape: tuple[int, ...], s: Array, t: Array, i: int, j: int) -> Array:
-    """The derivative of order (i, j) of the polynomial with coefficients c(a, b), `shape` being (d, K, L)."""
-    d, order_u, order_v = shape
-    rows = [horner([c(a, b) for b in range(order_v)], t[None], j) for a in range(order_u)]
-    everywhere = (d, *jnp.broadcast_shapes(c(0, 0).shape[1:], s.shape))
-    return jnp.broadcast_to(horner(rows, s[None], i), everywhere)
+def horner(c: Sequence[Array], x: Array, derivative: int, begin: int = 0) -> Any:
+    """p(x) or a derivative, for p with the coefficients c of x^begin, x^(begin + 1), ..., by nested
+    multiplication; `begin` is at most `derivative`.
+    """
+    result: Any = None
+    for power in reversed(range(derivative, begin + len(c))):
+        factor, term = math.perm(power, derivative), c[power - begin]
+        term = term if factor == 1 else float(factor) * term
+        result = term if result is None else result * x + term
+    return jnp.zeros_like(x) if result is None else result
 
 
-def horner(c: Sequence[Array], x: Array, derivative: int) -> Array:
-    """p(x), p'(x) or p''(x) for p with coefficients c[0] + c[1] x + ..., by nested multiplication."""
-    terms = []
-    for power in range(derivative, len(c)):
-        factor = math.perm(power, derivative)
-        terms.append(c[power] if factor == 1 else float(factor) * c[power])
-    if not terms:
-        return jnp.zeros_like(c[0])
-    result = terms[-1]
-    for term in reversed(terms[:-1]):
-        result = result * x + term
-    return result
+def powers(x: Float[Array, "..."], count: int) -> Float[Array, "count ..."]:
+    """1, x, x^2, ..."""
+    found, power = jnp.ones_like(x)[None], x[None]
+    while found.shape[0] < count:
+        found = jnp.concatenate([found, found[: count - found.shape[0]] * power])
+        power = power * power
+    return found

@@ -36,7 +36,7 @@ class Rows(eqx.Module):
 
     def spread(self, x: Shaped[Array, "d points"]) -> Shaped[Array, "d rows width"]:
         """Per-point values, laid out in rows; empty slots hold some point's value, never NaN."""
-        return x[:, jnp.minimum(self.point, self.points - 1)]
+        return x.at[:, self.point].get(mode="clip", wrap_negative_indices=False)
 
     def block(self, start: Int[Array, ""], size: int) -> "Rows":
         """`size` of the rows (moved back where fewer are left)."""
@@ -52,9 +52,7 @@ def row_width(points: int, cells: int) -> int:
 
 
 def narrow_width(points: int, cells: int) -> int:
-    """Three quarters of `row_width`: for passes that move feet as well, in which empty slots cost as much as
-    full ones.
-    """
+    """Three quarters of `row_width`: where work on a slot costs more than work on a row."""
     return 3 * row_width(points, cells) // 4
 
 

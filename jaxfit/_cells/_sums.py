@@ -8,13 +8,16 @@ are linear images of the moments sum_k w_k s_k^a t_k^b x_k. Moments are sums alo
 one cell are added up, and the image is one fixed matrix per span and direction.
 """
 
-from typing import Any
+from functools import reduce
+from operator import add, mul
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._cells._overlap import overlap_add
+from jaxfit._cells._polynomials import powers
 from jaxfit._cells._rows import Rows
 from jaxfit._splines._pieces import Numbers
 
@@ -45,18 +48,10 @@ def row_moments(
     order_v: int,
 ) -> Float[Array, "rows K Lc"]:
     """Sums over each row of s^a t^b x, the last index running over b and within it over the values x."""
-    powers_s, powers_t = _powers(s, order_u), _powers(t, order_v)
-    product = (powers_t[:, None] * values[None]).reshape(-1, *s.shape)
+    product = (powers(t, order_v)[:, None] * values[None]).reshape(-1, *s.shape)
     # One small matrix product a row, each row's sums side by side as the sum over rows reads them.
     across, rows = ((2,), (2,)), ((1,), (1,))
-    return lax.dot_general(powers_s, product, (across, rows), precision=lax.Precision.HIGHEST)
-
-
-def _powers(x: Float[Array, "rows width"], order: int) -> Float[Array, "order rows width"]:
-    powers = [jnp.ones_like(x)]
-    for _ in range(order - 1):
-        powers.append(powers[-1] * x)
-    return jnp.stack(powers)
+    return lax.dot_general(powers(s, order_u), product, (across, rows), precision=lax.Precision.HIGHEST)
 
 
 def cells_to_net(
@@ -67,19 +62,12 @@ def cells_to_net(
     """One direction at a time: moments into sums for the basis functions of a span, then spans overlapped."""
     (spans_u, order_u, _), (spans_v, order_v, _) = poly_u.shape, poly_v.shape
     x = moments.reshape(spans_u, spans_v, order_u, order_v, -1)
-    terms = [
-        sum(poly_v[None, :, None, q, b, None] * x[:, :, :, b] for b in range(order_v)) for q in range(order_v)
-    ]
-    x = _overlapped(terms, 1)
-    terms = [sum(poly_u[:, None, r, a, None] * x[:, :, a] for a in range(order_u)) for r in range(order_u)]
-    return _overlapped(terms, 0)
+    x = overlap_add(_basis_sums(jnp.reshape(poly_v, (1, spans_v, 1, order_v**2, 1)), x, 3), 1)
+    x = overlap_add(_basis_sums(jnp.reshape(poly_u, (spans_u, 1, order_u**2, 1, 1)), x, 2), 0)
+    return x.reshape(*x.shape[:2], -1)
 
 
-def _overlapped(terms: list[Any], axis: int) -> Any:
-    """The sum of the terms, each one place farther along `axis`."""
-    shape, size = list(terms[0].shape), terms[0].shape[axis]
-    shape[axis] += len(terms) - 1
-    total = jnp.zeros(shape, terms[0].dtype)
-    for i, x in enumerate(terms):
-        total = total.at[(slice(None),) * axis + (slice(i, i + size),)].add(x)
-    return total
+def _basis_sums(polynomials: Array, moments: Array, axis: int) -> list[Array]:
+    """For each basis function of a span its polynomial's coefficients times the moments along `axis`."""
+    x, c = (lax.split(y, (1,) * y.shape[axis], axis) for y in (moments, polynomials))
+    return [reduce(add, map(mul, c[k : k + len(x)], x)) for k in range(0, len(c), len(x))]

@@ -1,16 +1,43 @@
-"""From starting parameters to converged feet: the kernel every closest point and every fit calls."""
+"""From starting parameters to converged feet, on the borders too where a foot is found nowhere else."""
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._closest._feet import ARRIVED, GIVEN_UP, Feet, Limits, keep, new_feet
-from jaxfit._closest._passes import Border, settle
-from jaxfit._closest._steps import AbstractFootMethod
+from jaxfit._closest._feet import FOUND, GIVEN_UP, GOING, Feet, Limits, keep
+from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._iterate_feet import iterate_feet
 from jaxfit._splines._pieces import Pieces
 
 EVERYWHERE, AGAIN = 0, 5  # stages; those between are the four borders
+
+Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v: of all points, or of each
+
+
+def initial_feet(
+    pieces: Pieces,
+    u: Float[Array, " points"],
+    v: Float[Array, " points"],
+    idle: Bool[Array, " points"] | None,
+    within: Border | None,
+    done: int,
+) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
+    """Feet at the nearest places to (u, v) in the domain, `idle` ones in the state `done`; and their bounds."""
+    low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
+    u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
+    feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
+    return feet, None if within is None else _as_bounds(within)
+
+
+def _domain(pieces: Pieces) -> Border:
+    along_u, along_v = pieces.axis_u.breaks, pieces.axis_v.breaks
+    return along_u[0], along_u[-1], along_v[0], along_v[-1]
+
+
+def _as_bounds(border: Border) -> Float[Array, "2 2 _"]:
+    low_u, high_u, low_v, high_v = (jnp.reshape(x, -1) for x in border)
+    return jnp.stack([low_u, low_v, high_u, high_v]).reshape(2, 2, -1)
 
 
 def project(
@@ -34,17 +61,9 @@ def project(
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
-    axes = (pieces.axis_u, pieces.axis_v)
-    u, v = (jnp.clip(x, a.breaks[0], a.breaks[-1]) for x, a in zip((u, v), axes, strict=True))
-    if within is not None:
-        u, v = jnp.clip(u, *within[:2]), jnp.clip(v, *within[2:])
-    feet = new_feet(u, v)
-    if idle is not None:
-        feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
-    if within is not None:
-        return settle(method, pieces, target, feet, within, limits)
-    if not borders:
-        return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
+    feet, bounds = initial_feet(pieces, u, v, idle, within, FOUND)
+    if within is not None or not borders:
+        return iterate_feet(method, pieces, target, feet, limits, bounds)[0]
     return _in_stages(method, pieces, target, feet, limits)
 
 
@@ -61,28 +80,29 @@ def _in_stages(method: AbstractFootMethod, pieces: Pieces, target: Array, feet: 
         number, old = carry
         border = _border(pieces, number)
         budget = Limits(limits.tolerance, limits.noise, (number + 1) * limits.steps)
-        new = settle(method, pieces, target, _begin(old, number, border), border, budget)
+        begun = _begin(old, number, border)
+        new, _ = iterate_feet(method, pieces, target, begun, budget, _as_bounds(border))
         return number + 1, _merge(old, new, number, limits)
 
     return lax.while_loop(unsettled, stage, (jnp.asarray(EVERYWHERE, jnp.int32), feet))[1]
 
 
 def _border(pieces: Pieces, number: Array) -> Border:
-    """Bounds (low_u, high_u, low_v, high_v) of a stage: the domain, or one of its sides."""
-    bounds = []
-    for axis, low_side in ((pieces.axis_u, 1), (pieces.axis_v, 3)):
-        first, last = axis.breaks[0], axis.breaks[-1]
-        bounds.append(jnp.where(number == low_side + 1, last, first))
-        bounds.append(jnp.where(number == low_side, first, last))
-    return bounds[0], bounds[1], bounds[2], bounds[3]
+    """The bounds of a stage: the domain, or one of its sides."""
+    low_u, high_u, low_v, high_v = _domain(pieces)
+    return (
+        jnp.where(number == 2, high_u, low_u),
+        jnp.where(number == 1, low_u, high_u),
+        jnp.where(number == 4, high_v, low_v),
+        jnp.where(number == 3, low_v, high_v),
+    )
 
 
 def _begin(old: Feet, number: Array, border: Border) -> Feet:
     """The feet a stage works on; after the first, those not converged, afresh from their best."""
     low_u, high_u, low_v, high_v = border
-    fresh = new_feet(jnp.clip(old.best_u, low_u, high_u), jnp.clip(old.best_v, low_v, high_v))
-    fresh = Feet(fresh.real, jnp.stack([fresh.halvings, old.steps, fresh.state]))
-    return keep(old.converged | (number == EVERYWHERE), old, fresh)
+    best_u, best_v = jnp.clip(old.best_u, low_u, high_u), jnp.clip(old.best_v, low_v, high_v)
+    return keep(old.converged | (number == EVERYWHERE), old, Feet.begin(best_u, best_v, steps=old.steps))
 
 
 def _merge(old: Feet, new: Feet, number: Array, limits: Limits) -> Feet:
@@ -90,6 +110,6 @@ def _merge(old: Feet, new: Feet, number: Array, limits: Limits) -> Feet:
     nearer = new.best < old.best - limits.slack(old.best)
     nearer = jnp.where(jnp.isinf(old.best), jnp.isfinite(new.best), nearer)
     whole = (number == EVERYWHERE) | (number == AGAIN)
-    state = jnp.where(new.converged & whole, ARRIVED, GIVEN_UP)
-    spent = Feet(old.real, new.whole).standing(jnp.full_like(state, GIVEN_UP))
-    return keep(old.converged, old, keep(nearer | whole, new.standing(state), spent))
+    state = jnp.where(new.converged & whole, FOUND, GIVEN_UP)
+    spent = Feet(old.real, new.whole).with_state(jnp.full_like(state, GIVEN_UP))
+    return keep(old.converged, old, keep(nearer | whole, new.with_state(state), spent))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfit._closest import AbstractFootMethod, Border, project
+from jaxfit._closest import AbstractFootMethod, Border, project, update_feet
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._splines._pieces import Axis, Pieces
@@ -20,13 +20,26 @@ def measure_feet(
     pieces: Pieces,
     before: Projection,
     foot_tolerance: Any,
-    idle: Bool[Any, " points"],
-    borders: bool,
+) -> Projection:
+    """Local feet from the last ones, converged on the surface, and the errors there."""
+    idle, tolerance = ~jnp.asarray(problem.real), foot_tolerance * problem.diagonal
+    feet, _ = update_feet(method, pieces, problem.target, before.u, before.v, tolerance, idle=idle)
+    active = jnp.sum(problem.counted, dtype=jnp.int32)
+    return Projection(feet.u, feet.v, feet.error, feet.evaluations, feet.converged, active, jnp.asarray(True))
+
+
+def measure_grid(
+    method: AbstractFootMethod,
+    problem: Problem,
+    pieces: Pieces,
+    before: Projection,
+    foot_tolerance: Any,
+    held: Bool[Any, " points"],
     within: Border | None = None,
 ) -> Projection:
-    """Feet from the last ones, converged on the surface, and the errors there; `idle` points have none.
+    """Feet of a grid's points, but those that are `held`; where they do not converge, on the borders.
 
-    `borders` and `within` are those of `project`.
+    `within` are bounds of every foot's own.
     """
     feet = project(
         method,
@@ -36,11 +49,11 @@ def measure_feet(
         before.v,
         foot_tolerance * problem.diagonal,
         jnp.asarray(FOOT_STEPS, jnp.int32),
-        jnp.asarray(idle),
-        borders,
+        jnp.asarray(held),
+        True,
         within,
     )
-    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
+    error = jnp.where(held, 0.0, jnp.sqrt(jnp.where(held, 0.0, feet.best)))
     active = jnp.sum(problem.counted, dtype=jnp.int32)
     return Projection(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True))
 

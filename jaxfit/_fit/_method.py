@@ -9,6 +9,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Int
 
+from jaxfit._checks import check_kind, check_number
+from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -103,3 +105,11 @@ class AbstractIterativeMethod(eqx.Module):
 def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
     """The fields that are traced numbers, and the others (`equinox.partition`)."""
     return eqx.partition(method, lambda x: isinstance(x, float | np.ndarray | jax.Array))
+
+
+def check_method(method: Any) -> None:
+    """The fields that methods have in common."""
+    check_number("stall_window", method.stall_window, 1, whole=True)
+    check_number("stall_gain", method.stall_gain, 0.0)
+    check_number("foot_tolerance", method.foot_tolerance, 0.0)
+    check_kind("foot_method", method.foot_method, AbstractFootMethod, "Newton()")

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxfit._checks import is_concrete
 from jaxfit._fit._history import History
 from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._summary import describe, describe_briefly
 from jaxfit._splines import BSplineSurface
 
 
@@ -52,6 +53,12 @@ class Fit(eqx.Module):
     history: History
     result: Any
     stats: dict[str, Any]
+
+    def __str__(self) -> str:
+        return describe(self)
+
+    def __repr__(self) -> str:
+        return describe_briefly(self)
 
     @property
     def converged(self) -> Any:

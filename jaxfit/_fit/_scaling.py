@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._checks import is_concrete
+from jaxfit._checks import check_resolution, is_concrete
 from jaxfit._precision import working_dtype
 
 
@@ -110,6 +110,7 @@ def unit_of(points: Any, name: str = "points") -> Unit:
             raise ValueError(
                 f"{name} must not all coincide, but their bounding box has no extent; give distinct points."
             )
+        check_resolution(name, low, high, diagonal)
         info = np.finfo(working_dtype())
         if diagonal < info.tiny / info.eps or max(-low.min(), high.max()) > info.max:
             raise ValueError(

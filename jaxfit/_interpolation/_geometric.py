@@ -13,8 +13,8 @@ from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_feet, side_bounds
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._measure import measure_grid, side_bounds
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._result import Fit
@@ -127,11 +127,11 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
             ("parametrisation", AbstractParametrisation, "ChordLength()"),
             ("repositioning", AbstractRepositioning, "OptimalRepositioning()"),
             ("acceleration", AbstractAcceleration, "Richardson()"),
-            ("foot_method", AbstractFootMethod, "Newton()"),
             ("symmetry", (Reflection, type(None)), "Reflection()"),
             ("adjoint", AbstractAdjoint, "UnrolledAdjoint()"),
         ):
             check_kind(name, getattr(self, name), kind, example)
+        check_method(self)
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
@@ -174,14 +174,13 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         nu, nv = surface.control_points.shape[:2]
         held = corners(nu, nv).reshape(-1)
         within = side_bounds(surface.axes, nu, nv) if self.keep_borders else None
-        here = measure_feet(
+        here = measure_grid(
             self.foot_method,
             problem,
             surface.pieces,
             iterate.projection,
             self.foot_tolerance,
             held,
-            True,
             within,
         )
         state: GeometricState = iterate.state

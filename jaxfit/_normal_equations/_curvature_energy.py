@@ -49,9 +49,9 @@ def curvature_energy(surface: BSplineSurface, points: int = 6) -> Float[Array, "
     pieces = make_pieces(net, surface.knots_u, surface.knots_v)
     nodes, weights = np.polynomial.legendre.leggauss(points)
     s, t = (jnp.asarray(x.reshape(-1), net.dtype) for x in np.meshgrid(nodes, nodes, indexing="ij"))
+    s, t = (jnp.broadcast_to(x, (pieces.cells, x.size)) for x in (s, t))
     weight = jnp.asarray(np.outer(weights, weights).reshape(-1), net.dtype)
-    coefficients = jnp.moveaxis(jnp.asarray(pieces.coefficients), 0, -1)[..., None]
-    density = _density(evaluate_jet(coefficients, s[None], t[None]))
+    density = _density(evaluate_jet(jnp.asarray(pieces.coefficients), s, t))
     # The integrand needs no parameters: in local coordinates every cell is [-1, 1]^2. Empty ones are skipped.
     width_u, width_v = (jnp.diff(jnp.asarray(x.breaks)) > 0 for x in (pieces.axis_u, pieces.axis_v))
     taken = (width_u[:, None] & width_v[None, :]).reshape(-1)

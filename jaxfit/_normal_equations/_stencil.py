@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._splines._pieces import Numbers
@@ -32,21 +32,9 @@ class Stencil(eqx.Module):
         return self.entries[0, 0]
 
     def __call__(self, net: Float[Numbers, "nu nv c"]) -> Float[Array, "nu nv c"]:
-        """The matrix times a net, every coordinate for itself: shifted copies, no gather."""
-        order_u, order_v, nu, nv = self.entries.shape
-        reach_u, reach_v = order_u - 1, order_v - 1
-        sides = ((0, 0), (reach_u, reach_u), (reach_v, reach_v))
-        wide = jnp.pad(jnp.moveaxis(jnp.asarray(net), 2, 0), sides)
-        entries = jnp.pad(self.entries, ((0, 0), (0, 0), (reach_u, 0), (reach_v, 0)))
-        total: Any = 0.0
-        for a in range(-reach_u, reach_u + 1):
-            rows = wide[:, reach_u + a : reach_u + a + nu]
-            first = reach_u + min(a, 0)
-            for b in range(-reach_v, reach_v + 1):
-                column = reach_v + min(b, 0)
-                entry = entries[abs(a), abs(b), first : first + nu, column : column + nv]
-                total = total + entry[None] * rows[:, :, reach_v + b : reach_v + b + nv]
-        return jnp.moveaxis(total, 0, 2)
+        """The matrix times a net, every coordinate for itself."""
+        channels = jnp.moveaxis(jnp.asarray(net), 2, 0)[None]
+        return jnp.moveaxis(shifted_products(self.entries[None, None], channels), 0, 2)
 
     def plus(self, other: "Stencil", factor: Any) -> "Stencil":
         """The sum of this and `factor` times the other."""
@@ -63,17 +51,51 @@ class Stencil(eqx.Module):
         return self(unit).reshape(nu * nv, nu * nv)
 
 
-def product(along_u: Float[Numbers, "K nu"], along_v: Float[Numbers, "L nv"]) -> Float[Numbers, "K L nu nv"]:
-    """Entries of a tensor product of banded symmetric matrices, given as `band[a, i]` = entry (i, i + a)."""
-    return along_u[:, None, :, None] * along_v[None, :, None, :]
+def shifted_products(
+    entries: Float[Numbers, "p q K L nu nv"], x: Float[Array, "q r nu nv"]
+) -> Float[Array, "s nu nv"]:
+    r"""$\sum_q E_q x_q$ over all neighbours, with stencils $E_{pq}$; p or r is 1, and s the other.
+
+    One loop over the shifts (a, b) and over q. Written out it would be 49 products for bicubic splines, which
+    take half a second to compile and run hardly faster.
+    """
+    p, q, order_u, order_v, nu, nv = entries.shape
+    reach_u, reach_v = order_u - 1, order_v - 1
+    wide = jnp.pad(x, ((0, 0), (0, 0), (reach_u, reach_u), (reach_v, reach_v)))
+    entries = jnp.pad(entries, ((0, 0),) * 4 + ((reach_u, 0), (reach_v, 0)))
+    a, b, number = np.indices((2 * order_u - 1, 2 * order_v - 1, q), np.int32).reshape(3, -1)
+    shift_u, shift_v = a - reach_u, b - reach_v
+    # Entries of a neighbour before this control point are stored with the neighbour.
+    stored = (number, abs(shift_u), abs(shift_v), np.minimum(a, reach_u), np.minimum(b, reach_v))
+    zero = np.int32(0)
+
+    def add(total: Array, at: tuple[tuple[Array, ...], Array, Array]) -> tuple[Array, None]:
+        place, a, b = at
+        size = (p, 1, 1, 1, nu, nv)
+        entry = lax.dynamic_slice(entries, (zero, *place), size, allow_negative_indices=False)
+        start, size = (place[0], zero, a, b), (1, x.shape[1], nu, nv)
+        neighbour = lax.dynamic_slice(wide, start, size, allow_negative_indices=False)
+        return total + lax.squeeze(entry, (1, 2, 3)) * lax.squeeze(neighbour, (0,)), None
+
+    none = jnp.zeros((max(p, x.shape[1]), nu, nv), jnp.result_type(entries, x))
+    return lax.scan(add, none, (stored, a, b))[0]
 
 
-def overlapped(terms: list[Any], count: int, axis: int) -> Any:
-    """The sum of the terms, each one place farther along `axis` and padded there to `count` places."""
-    xp: Any = np if isinstance(terms[0], np.ndarray) else jnp
+def overlap_add(terms: Float[Numbers, "r ..."], axis: int) -> Any:
+    """The sum of `terms[r]`, each moved r places along `axis`, which grows by as many less one."""
     total: Any = 0.0
-    for place, x in enumerate(terms):
-        after = count - place - x.shape[axis]
-        sides = [(place, after) if k == axis % x.ndim else (0, 0) for k in range(x.ndim)]
-        total = total + xp.pad(x, sides)
+    last, axis = len(terms) - 1, axis % (terms.ndim - 1)
+    for r in range(last + 1):
+        sides = [(r, last - r) if k == axis else (0, 0) for k in range(terms.ndim - 1)]
+        if isinstance(terms, np.ndarray):
+            total = total + np.pad(terms[r], sides)
+        else:
+            total = total + lax.pad(terms[r], jnp.zeros((), terms.dtype), [(*side, 0) for side in sides])
     return total
+
+
+def windows(x: Any, count: int, size: int, axis: int) -> Any:
+    """`size` entries along `axis` from each of the first `count` places, along a new first axis."""
+    if isinstance(x, np.ndarray):
+        return np.stack([np.take(x, range(r, r + size), axis) for r in range(count)])
+    return jnp.stack([lax.slice_in_dim(x, r, r + size, axis=axis) for r in range(count)])

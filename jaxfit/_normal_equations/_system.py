@@ -24,7 +24,7 @@ from jaxfit._cells import (
     row_width,
     rows_of,
 )
-from jaxfit._normal_equations._moments import normal_stencil
+from jaxfit._normal_equations._normal_matrix import normal_stencil
 from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
@@ -34,7 +34,7 @@ SCARCE = 1e-5  # of the greatest diagonal entry: control points reached by less 
 Residual = tuple[Float[Array, "d rows width"], Bending]
 
 
-class System(eqx.Module):
+class RegularisedSystem(eqx.Module):
     """Points in rows, with the square roots of their weights (0 for empty slots)."""
 
     rows: Rows
@@ -58,25 +58,29 @@ class System(eqx.Module):
     def data_residual(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
         """sqrt(w) (A P - Q)."""
         pieces = pieces_on(net, self.axis_u, self.axis_v)
-        on_surface = evaluate_values(row_coefficients(pieces, self.rows)[..., None], self.s, self.t)
+        on_surface = evaluate_values(row_coefficients(pieces, self.rows), self.s, self.t)
         return self.root[None] * (on_surface - self.target)
 
     def residual(self, net: Float[Array, "nu nv d"]) -> Residual:
         """Both parts of what is squared and summed."""
-        plate = self.plate.residual(net)
         root = jnp.sqrt(jnp.asarray(self.smoothing, net.dtype))
-        return self.data_residual(net), (root * plate[0], root * plate[1], root * plate[2])
+        return self.data_residual(net), root * self.plate.residual(net)
 
     def adjoint(self, residual: Residual) -> Float[Array, "nu nv d"]:
         """The transposed Jacobian times a residual: half the gradient of F, at `residual(net)`."""
         data, bending = residual
-        # A wall, or each of the many sums would compute the residual for itself.
-        sums = materialise(self.root[0, 0] >= 0, lambda data: self._sums(data), data)
-        return sums + jnp.sqrt(jnp.asarray(self.smoothing, data.dtype)) * self.plate.adjoint(bending)
+        root = jnp.sqrt(jnp.asarray(self.smoothing, data.dtype))
+        return self.data_adjoint(data) + root * self.plate.adjoint(bending)
 
-    def _sums(self, data: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
-        values = self.root[None] * data
-        return net_sums(self.rows, self.s, self.t, values, self.axis_u.polynomials, self.axis_v.polynomials)
+    def data_adjoint(self, residual: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
+        """A^T sqrt(w) times a residual of the data."""
+
+        def sums(residual: Array) -> Array:
+            polynomials = self.axis_u.polynomials, self.axis_v.polynomials
+            return net_sums(self.rows, self.s, self.t, self.root[None] * residual, *polynomials)
+
+        # Stored, or each of the many sums would compute the residual for itself.
+        return materialise(self.root[0, 0] >= 0, sums, residual)
 
 
 def make_system(
@@ -86,20 +90,20 @@ def make_system(
     target: Float[Any, "d points"],
     weight: Float[Any, " points"],
     smoothing: Float[Any, ""],
-) -> System:
+) -> RegularisedSystem:
     """Points with parameters (u, v) laid out on the cells of `pieces`, whose net does not matter."""
     width = row_width(u.shape[0], pieces.cells)
     rows = rows_of(pieces, u, v, width, weight <= 0)
 
-    def laid_out() -> tuple[Array, Array, Array, Array]:
+    def in_rows() -> tuple[Array, Array, Array, Array]:
         spread = rows.spread(jnp.concatenate([jnp.stack([u, v, weight]), target]))
         s, t = local_coordinates(pieces, rows.cell[:, None], spread[0], spread[1])
         root = jnp.sqrt(jnp.where(rows.filled, spread[2], 0.0))
         return s, t, root, spread[3:]
 
-    s, t, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], laid_out)
+    s, t, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], in_rows)
     plate = thin_plate(pieces.axis_u, pieces.axis_v)
-    return System(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
+    return RegularisedSystem(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
 
 
 def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu nv"]:

@@ -35,7 +35,7 @@ def collocation_band(
     in the band; what others have outside is dropped.
     """
     first, weights = spans_and_weights(knots, order, u, derivatives, False)
-    entries = jnp.stack([jnp.stack(each, axis=-1) for each in weights], axis=1)
+    entries = weights.transpose(2, 0, 1)
     entries = jnp.concatenate([entries[:-1], entries[-1:, ::-1]])
     count = u.shape[0] * len(derivatives)
     row = jnp.arange(count)

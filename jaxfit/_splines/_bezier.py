@@ -5,10 +5,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxfit._checks import is_concrete
 from jaxfit._splines._basis import blossom_weights, local_knots
+from jaxfit._splines._lookup import windows
 
 
 class BezierCurves(NamedTuple):
@@ -64,14 +66,12 @@ def bezier_along(
 @jax.jit
 def _bezier_points(control_points: Array, knots: Array, spans: Array) -> Array:
     order = knots.shape[0] - control_points.shape[0]
-    shape = (spans.shape[0], order)
-    local = [jnp.broadcast_to(t[:, None], shape) for t in local_knots(knots, order, spans)]
-    start, stop = local[order - 2], local[order - 1]
-    position = jnp.broadcast_to(jnp.arange(order)[None, :], shape)
-    arguments = [jnp.where(position >= step, stop, start) for step in range(1, order)]
-    weights = blossom_weights(local, arguments, jnp.ones(shape, knots.dtype))
-    pieces = jnp.zeros((*shape, *control_points.shape[1:]), control_points.dtype)
-    for r, w in enumerate(weights):
-        weight = w.reshape(*shape, *(1,) * (control_points.ndim - 1))
-        pieces = pieces + weight * control_points[spans - (order - 1) + r][:, None]
-    return pieces
+    local = local_knots(knots, order, spans)
+    # Point j takes the end of the span as its last j arguments, and the start as the others.
+    at_end = np.arange(order)[None, :] + np.arange(order - 1)[:, None] >= order - 1
+    ends = local[order - 2 : order][:, None, :, None]
+    arguments = jnp.where(at_end[:, None, :], ends[1], ends[0])
+    local = jnp.broadcast_to(local[..., None], (*local.shape, order))
+    weights = blossom_weights(local, arguments)
+    near = windows(control_points, spans - (order - 1), order)
+    return jnp.einsum("rs...,rsj->sj...", near, weights, precision=lax.Precision.HIGHEST)

@@ -4,10 +4,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from jaxfit._splines._basis import as_parameters, blossom_weights, find_span, local_knots
+from jaxfit._splines._lookup import windows
 
 
 def refined_knots(knots: Float[Array, " knots"], new_knots: ArrayLike) -> Float[Array, " refined"]:
@@ -17,7 +20,7 @@ def refined_knots(knots: Float[Array, " knots"], new_knots: ArrayLike) -> Float[
 
 def insertion_weights(
     knots: Float[Array, " knots"], refined: Float[Array, " refined"], order: int
-) -> tuple[Int[Array, " n"], list[Float[Array, " n"]]]:
+) -> tuple[Int[Array, " n"], Float[Array, "order n"]]:
     r"""Each refined control point as a sum of `order` consecutive old ones.
 
     The refined point $j$ is the blossom of the old polynomial piece at the refined knots
@@ -28,14 +31,13 @@ def insertion_weights(
     -------
     first : array (n_refined,)
         Index of the first old control point of each sum.
-    weights : list of `order` arrays (n_refined,)
+    weights : array (order, n_refined)
         Non-negative, of sum one.
     """
     count = refined.shape[0] - order
     span = find_span(knots, order, refined[:count])
-    arguments = [refined[i : i + count] for i in range(1, order)]
-    ones = jnp.ones(count, knots.dtype)
-    weights = blossom_weights(local_knots(knots, order, span), arguments, ones)
+    arguments = windows(refined, np.arange(1, count + 1), order - 1)
+    weights = blossom_weights(local_knots(knots, order, span), arguments)
     return span - (order - 1), weights
 
 
@@ -65,7 +67,7 @@ def insertion_matrix(
     columns = first[:, None] + jnp.arange(order)[None, :]
     rows = jnp.arange(first.shape[0])[:, None]
     matrix = jnp.zeros((first.shape[0], knots.shape[0] - order), knots.dtype)
-    return matrix.at[rows, columns].set(jnp.stack(weights, axis=-1))
+    return matrix.at[rows, columns].set(weights.T)
 
 
 @jax.jit
@@ -76,11 +78,8 @@ def insert_along(
     order = knots.shape[0] - control_points.shape[0]
     refined = refined_knots(knots, new_knots)
     first, weights = insertion_weights(knots, refined, order)
-    ones = (1,) * (control_points.ndim - 1)
-    moved = jnp.zeros((first.shape[0], *control_points.shape[1:]), control_points.dtype)
-    for r, w in enumerate(weights):
-        old = control_points.at[first + r].get(mode="promise_in_bounds")
-        moved = moved + w.reshape(-1, *ones) * old
+    near = windows(control_points, first, order)
+    moved = jnp.einsum("ri...,ri->i...", near, weights, precision=lax.Precision.HIGHEST)
     return moved, refined
 
 

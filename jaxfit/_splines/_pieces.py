@@ -9,7 +9,6 @@ monomials of low degree are well conditioned, so little is lost against the recu
 same with a single cell and order 1 in v.
 """
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -18,12 +17,10 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._barrier import materialise
 from jaxfit._checks import is_concrete
+from jaxfit._splines._lookup import last_not_above, windows
 
 Numbers = Array | np.ndarray
-
-UNROLLED = 30  # terms of a sum
 
 
 class Axis(eqx.Module):
@@ -84,22 +81,8 @@ class Axis(eqx.Module):
         if is_concrete(self, u):
             number = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
             return np.clip(number, *np.asarray(self.ends)).astype(np.int32)
-        inner = _last_not_above(jnp.asarray(self.breaks), jnp.asarray(u))
-        return jnp.clip(inner, self.ends[0], self.ends[1]).astype(jnp.int32)
-
-
-def _last_not_above(breaks: Float[Array, " breaks"], u: Float[Array, "..."]) -> Int[Array, "..."]:
-    """The last i with breaks[i] <= u, by counting: every so many breaks, then those between.
-
-    Two short sums without memory between compile and run faster than bisection. The first costs least, up to
-    the length that is compiled without a loop.
-    """
-    count = breaks.shape[0]
-    stride = min(math.isqrt(count), -(-count // UNROLLED))
-    coarse = breaks[::stride].reshape((-1,) + (1,) * u.ndim) <= u[None]
-    first = jnp.maximum(jnp.sum(coarse, axis=0, dtype=jnp.int32) - 1, 0) * stride
-    padded = jnp.concatenate([breaks, jnp.full(stride, jnp.inf, breaks.dtype)])
-    return first + sum((padded[first + i] <= u).astype(jnp.int32) for i in range(1, stride))
+        ends = np.asarray(self.ends) if is_concrete(self.ends) else self.ends
+        return lax.clamp(ends[0], last_not_above(self.breaks, jnp.asarray(u)), ends[1])
 
 
 class Pieces(eqx.Module):
@@ -129,42 +112,50 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     concrete = is_concrete(knots)
     xp: Any = np if concrete else jnp
     dtype, knots = knots.dtype, np.asarray(knots, np.float64) if concrete else knots
-    breaks = knots[order - 1 : knots.shape[0] - order + 1]
-    cells = breaks.shape[0] - 1
-    number = xp.arange(cells)
-    repeats = xp.sum(breaks[:, None] == knots[None, :], axis=1)
-    at_end = (breaks <= breaks[0]) | (breaks >= breaks[-1])  # more often where there are surplus knots
-    crease = (repeats >= max(order - 1, 1)) | at_end
-    filled = breaks[1:] > breaks[:-1]
-    # The nearest crease to the left and to the right; empty spans neither start nor end a stretch.
-    first = _highest_so_far(xp.where(crease[:-1] & filled, number, 0))
-    last = _lowest_from_here(xp.where(crease[1:] & filled, number, cells - 1))
-    ends = xp.stack([xp.argmax(filled), cells - 1 - xp.argmax(filled[::-1])])
-    # The filled cell on the other side of a crease; empty spans may lie between.
-    left = _highest_so_far(xp.where(filled, number, -1))[xp.maximum(first - 1, 0)]
-    right = _lowest_from_here(xp.where(filled, number, cells))[xp.minimum(last + 1, cells - 1)]
-    before = xp.where(first > ends[0], left, number)
-    after = xp.where(last < ends[1], right, number)
-    centre, half = _middles(breaks)
-    bounds = xp.stack([breaks[first], breaks[last + 1], centre, half])
+    cells = knots.shape[0] - 2 * order + 1
+    breaks = knots[order - 1 : order + cells]
+    low, high = breaks[:-1], breaks[1:]
+    width = high - low
+    filled = width > 0
+    centre, half = 0.5 * (low + high), _select(filled, 0.5 * width, 1.0)
+    number = np.arange(cells, dtype=np.int32)
+    # The nearest filled cell from here on, to the left and to the right.
+    left = _highest_so_far(_select(filled, number, -1))
+    right = _lowest_from_here(_select(filled, number, cells))
+    ends = xp.concatenate([right[:1], left[-1:]])
+    first, last = (xp.broadcast_to(end, (cells,)) for end in ends)
+    before, after, creased = number, number, False
+    if not simple or order == 2:
+        # A knot of multiplicity order - 1 lies as many knots away from the end of a filled span as fit.
+        reach = max(order - 2, 0)
+        starts = filled & (knots[order - 1 - reach : order - 1 - reach + cells] >= low)
+        stops = filled & (knots[order + reach : order + reach + cells] <= high)
+        creased = bool(np.any(starts & (low > breaks[0]))) if concrete else True
+        first = xp.maximum(_highest_so_far(_select(starts, number, 0)), first)
+        last = xp.minimum(_lowest_from_here(_select(stops, number, cells - 1)), last)
+        # The filled cell on the other side of a crease; empty spans may lie between.
+        before = _select(first > first[:1], windows(left, xp.maximum(first - 1, 0), 1)[0], number)
+        after = _select(last < last[-1:], windows(right, xp.minimum(last + 1, cells - 1), 1)[0], number)
+    bounds = xp.stack([windows(low, first, 1)[0], windows(high, last, 1)[0], centre, half])
     return Axis(
         breaks=breaks.astype(dtype),
         bounds=bounds.astype(dtype),
-        first=first.astype(np.int32),
-        last=last.astype(np.int32),
-        ends=ends.astype(np.int32),
-        before=before.astype(np.int32),
-        after=after.astype(np.int32),
-        polynomials=span_polynomials(knots, order).astype(dtype),
-        creased=bool(np.any(crease & ~at_end)) if concrete else order == 2 or not simple,
+        first=first,
+        last=last,
+        ends=ends,
+        before=before,
+        after=after,
+        polynomials=span_polynomials(knots, centre, half, order).astype(dtype),
+        creased=creased,
     )
 
 
-def _middles(breaks: Any) -> tuple[Any, Any]:
-    """Centre and half width of every span."""
-    xp: Any = np if is_concrete(breaks) else jnp
-    width = breaks[1:] - breaks[:-1]
-    return 0.5 * (breaks[1:] + breaks[:-1]), xp.where(width > 0, 0.5 * width, 1.0)
+def _select(condition: Any, x: Any, y: float | Any) -> Any:
+    """`x` where the condition holds, else `y`; either may be a number of the other's type."""
+    if is_concrete(condition, x, y):
+        return np.where(condition, x, y).astype(x.dtype)
+    y = y if np.ndim(y) else np.full(condition.shape, y, x.dtype)
+    return lax.select(condition, jnp.asarray(x), jnp.asarray(y))
 
 
 def _highest_so_far(x: Any) -> Any:
@@ -172,42 +163,49 @@ def _highest_so_far(x: Any) -> Any:
 
 
 def _lowest_from_here(x: Any) -> Any:
-    return -_highest_so_far(-x[::-1])[::-1]
+    return np.minimum.accumulate(x[::-1])[::-1] if is_concrete(x) else lax.cummin(x, reverse=True)
 
 
-def span_polynomials(knots: Float[Numbers, " knots"], order: int) -> Float[Numbers, "spans K K"]:
+def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Numbers, "spans K K"]:
     """Non-zero basis functions of every span as polynomials, M[span, r, a] of s^a, s in [-1, 1].
 
-    The Cox-de Boor recursion, (2)-(3) in the paper, carried out on coefficients: each of its factors
-    is a polynomial of degree one in s. Empty spans give finite values that nothing uses.
+    The Cox-de Boor recursion, (2)-(3) in the paper, carried out on coefficients for all r and spans at once:
+    each of its factors is a polynomial of degree one in s. Empty spans give finite values that nothing uses.
     """
-    xp: Any = np if is_concrete(knots) else jnp
-    centre, half = _middles(knots[order - 1 : knots.shape[0] - order + 1])
-    spans = centre.shape[0]
-
-    def knot(offset: int) -> Any:
-        return knots[order - 1 + offset : order - 1 + offset + spans]
-
-    one = xp.ones((spans, 1), knots.dtype)
-    basis = [xp.concatenate([one, xp.zeros((spans, order - 1), knots.dtype)], axis=1)]
-    for degree in range(1, order):
-        raised = [xp.zeros((spans, order), knots.dtype)] * (degree + 1)
-        for r in range(degree):
-            left, right = knot(r + 1 - degree), knot(r + 1)
-            width = right - left
-            share = xp.where(width > 0, 1.0, 0.0) / xp.where(width > 0, width, 1.0)
-            scaled = basis[r] * share[:, None]
-            raised[r] = raised[r] + _times_linear(scaled, right - centre, -half)
-            raised[r + 1] = raised[r + 1] + _times_linear(scaled, centre - left, half)
-        basis = raised
-    return xp.stack(basis, axis=1)
+    concrete, spans = is_concrete(knots, centre, half), centre.shape[0]
+    basis: Any = np.zeros((order, order, spans), knots.dtype)  # r, a, span
+    basis[0, 0] = 1.0
+    if order > 1:
+        # Knots in the coordinate s of the span, whose own ends are -1 and 1 also where it is empty.
+        local = ((windows(knots, np.arange(spans), 2 * order) - centre[None]) / half[None])[:, None]
+        local = np.asarray(local) if concrete else local
+        xp: Any = np if concrete else jnp
+        right = xp.maximum(local[order:], 1.0)
+        # Row r of step d are the knots that begin the supports of degree d; the last step comes first.
+        left = xp.minimum(windows(local, np.arange(1, order + 1), order - 1), -1.0)
+        if concrete:
+            for each in left[::-1]:
+                basis = _raised(basis, each, right)
+        else:
+            start = jnp.asarray(basis)
+            basis = lax.scan(lambda x, each: (_raised(x, each, right), None), start, left, reverse=True)[0]
+    return basis.transpose(2, 0, 1)
 
 
-def _times_linear(p: Any, constant: Any, slope: Any) -> Any:
-    """(constant + slope s) p(s), the highest coefficient of p being zero."""
-    xp: Any = np if is_concrete(p, constant, slope) else jnp
-    shifted = xp.concatenate([xp.zeros_like(p[:, :1]), p[:, :-1]], axis=1)
-    return constant[:, None] * p + slope[:, None] * shifted
+def _raised(basis: Any, left: Any, right: Any) -> Any:
+    """The polynomials of one degree more, for all supports, which begin at `left` and end at `right`."""
+    share = basis / (right - left)
+    shifted = _moved_on(share, 1)
+    return right * share - shifted + _moved_on(shifted - left * share, 0)
+
+
+def _moved_on(x: Any, axis: int) -> Any:
+    """The entries of `x` one place on, behind a zero; the last is dropped."""
+    if is_concrete(x):
+        moved = np.zeros_like(x)
+        moved.swapaxes(0, axis)[1:] = x.swapaxes(0, axis)[:-1]
+        return moved
+    return lax.pad(x, np.zeros((), x.dtype), [(int(i == axis), -int(i == axis), 0) for i in range(x.ndim)])
 
 
 def make_pieces(
@@ -223,27 +221,17 @@ def make_pieces(
 
 def pieces_on(control_points: Float[Numbers, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Pieces:
     """The pieces of a surface, its knots having been dealt with before."""
-    concrete = is_concrete(control_points, axis_u, axis_v)
     poly_u, poly_v = axis_u.polynomials, axis_v.polynomials
-    if concrete:
+    if concrete := is_concrete(control_points, axis_u, axis_v):
         poly_u, poly_v, control_points = (np.asarray(x) for x in (poly_u, poly_v, control_points))
     (cells_u, order_u, _), (cells_v, order_v, _) = poly_u.shape, poly_v.shape
-
-    # One direction at a time, as sums of shifted slices: no gather, and XLA fuses each.
-    def along_u(poly_u: Any, control_points: Any) -> Any:
-        return sum(
-            poly_u[:, r, :, None, None] * control_points[r : r + cells_u, None] for r in range(order_u)
-        )
-
-    if concrete:
-        rows = along_u(poly_u, control_points)
-    else:
-        rows = materialise(~(axis_u.breaks[0] > axis_u.breaks[-1]), along_u, poly_u, control_points)
-    both: Any = sum(
-        rows[:, :, r : r + cells_v, :, None] * poly_v[None, None, :, r, None, :] for r in range(order_v)
-    )
-    ordered = both.transpose(0, 2, 3, 1, 4)
-    coefficients = ordered.reshape(cells_u * cells_v, -1, order_u, order_v)
+    around = windows(control_points, np.arange(cells_u), order_u)
+    exact: Any = {} if concrete else {"precision": lax.Precision.HIGHEST}
+    rows = (np if concrete else jnp).einsum("ira,rimd->iamd", poly_u, around, **exact)
+    # Along v a sum of shifted slices, which XLA fuses: a product of matrices takes twice as long there.
+    along_v = poly_v.transpose(1, 0, 2)[:, None, None, :, None, :]
+    both: Any = sum(rows[:, :, r : r + cells_v, :, None] * along_v[r] for r in range(order_v))
+    coefficients = both.transpose(0, 2, 3, 1, 4).reshape(cells_u * cells_v, -1, order_u, order_v)
     return Pieces(coefficients, axis_u, axis_v)
 
 

@@ -36,11 +36,12 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = (".npz", "
     try:
         # Permission bits say too little (an administrator ignores them), so try.
         part.touch()
-        part.unlink()
     except OSError as error:
         raise InputError(
             f"no file can be written in the folder {part.parent}: {error.strerror or error}."
         ) from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:

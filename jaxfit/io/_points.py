@@ -2,8 +2,6 @@
 
 import dataclasses
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base import Boundary
+from jaxfit.io._arrays import load_arrays
 from jaxfit.io._point_data import InputError, PointData, grid_data
 from jaxfit.io._text import read_columns
 
@@ -61,7 +60,7 @@ def read_points(path: str | os.PathLike) -> PointData:
     check_input(path, SUFFIXES)
     if suffix in (".csv", ".xyz", ".txt"):
         return _from_array(read_columns(path), "points", path)
-    arrays, names = _load(path)
+    arrays, names = load_arrays(path, _KEYS)
     if suffix == ".npy" and "array" in arrays:
         array = arrays["array"]
         return _from_array(array, "grid" if array.ndim == 3 else "points", path)
@@ -86,7 +85,7 @@ def read_boundary(path: str | os.PathLike) -> Boundary:
     """
     path = Path(path)
     check_input(path, (".npz",))
-    boundary = _boundary(_load(path)[0], path)
+    boundary = _boundary(load_arrays(path, BOUNDARY_KEYS)[0], path)
     if boundary is None:
         raise InputError(f"{path} holds no boundary; store {', '.join(BOUNDARY_KEYS)} in it.")
     return boundary
@@ -105,24 +104,6 @@ def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
         )
     if path.stat().st_size == 0:
         raise InputError(f"{path} is empty; write it again.")
-
-
-def _load(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The known arrays of an .npz file (an .npy file's only one as 'array'), and all names."""
-    try:
-        with open(path, "rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            if isinstance(loaded, np.ndarray):
-                return {"array": loaded}, ["one array without a name"]
-            # Other keys may hold anything, so they are not read.
-            return {key: loaded[key] for key in loaded.files if key in _KEYS}, loaded.files
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except (ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(
-            f"{path} is damaged, or holds something else than plain NumPy arrays of numbers; "
-            "write it again with NumPy."
-        ) from error
 
 
 def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:

@@ -3,35 +3,27 @@
 import io
 import json
 import os
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfit._checks import check_kind
+from jaxfit._fit import Fit
 from jaxfit._splines import BSplineSurface
+from jaxfit.io._arrays import load_arrays
 from jaxfit.io._output import check_output, write_atomically
 from jaxfit.io._point_data import InputError
 from jaxfit.io._points import check_input
 
 _KEYS = ("control_points", "knots_u", "knots_v")
-# What the parsers raise on damaged files, and what a surface that is none raises.
-_DAMAGED = (
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    EOFError,
-    RuntimeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# What a parser raises on damaged files, and what a surface that is none raises.
+_DAMAGED = (ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
 
-def write_surface(path: str | os.PathLike, surface: BSplineSurface) -> None:
-    """Write a surface; the file appears whole or not at all, and replaces an older one.
+def write_surface(path: str | os.PathLike, surface: BSplineSurface | Fit) -> None:
+    """Write a surface, or that of a fit; the file appears whole or not at all, and replaces an older one.
 
     - ``.npz``: arrays ``control_points`` (nu, nv, d), ``knots_u``, ``knots_v`` and ``order``
       (2,), in the surface's own precision.
@@ -43,18 +35,22 @@ def write_surface(path: str | os.PathLike, surface: BSplineSurface) -> None:
     path
         The file; its suffix chooses the format.
     surface
-        The surface.
+        The surface, or a `jaxfit.Fit`.
 
     Raises
     ------
     InputError
         If the path cannot be written (see `check_output`).
+    TypeError
+        If `surface` is neither a surface nor a fit.
     ValueError
         If the surface has control points that are not finite.
     OSError
         If writing fails half-way, for instance because the disk is full.
     """
     check_output(path)
+    surface = surface.surface if isinstance(surface, Fit) else surface
+    check_kind("surface", surface, BSplineSurface, "fit.surface")
     control_points = np.asarray(surface.control_points)
     if not np.isfinite(control_points).all():
         raise ValueError(
@@ -95,15 +91,15 @@ def read_surface(path: str | os.PathLike) -> BSplineSurface:
     check_input(path, (".npz", ".json"))
     try:
         if path.suffix.lower() == ".json":
-            arrays = _from_geomdl(json.loads(path.read_text(encoding="utf-8")))
+            arrays = _from_geomdl(json.loads(path.read_text(encoding="utf-8")), path)
         else:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = [file[key] for key in _KEYS]
+            found = load_arrays(path, _KEYS)[0]
+            arrays = [found[key] for key in _KEYS]
         return BSplineSurface(*(jnp.asarray(x, jnp.result_type(float)) for x in arrays))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except InputError as error:
-        raise InputError(f"{path} {error}") from error
+    except InputError:
+        raise
     except _DAMAGED as error:
         raise InputError(
             f"{path} holds no B-spline surface that can be read ({_one_line(error)}); write it "
@@ -130,14 +126,16 @@ def _geomdl(control_points: np.ndarray, knots_u: np.ndarray, knots_v: np.ndarray
     return {"shape": {"type": "surface", "count": 1, "data": [surface]}}
 
 
-def _from_geomdl(document: dict[str, Any]) -> list[np.ndarray]:
+def _from_geomdl(document: dict[str, Any], path: Path) -> list[np.ndarray]:
     shape = document["shape"]
     if shape["type"] != "surface" or len(shape["data"]) != 1:
-        raise InputError(f"holds {len(shape['data'])} x {shape['type']}; keep exactly one surface in it.")
+        raise InputError(
+            f"{path} holds {len(shape['data'])} x {shape['type']}; keep exactly one surface in it."
+        )
     surface = shape["data"][0]
     weights = np.asarray(surface["control_points"].get("weights", 1.0))
     if np.ptp(weights):
-        raise InputError("holds a rational surface; only surfaces with equal weights can be read.")
+        raise InputError(f"{path} holds a rational surface; only surfaces with equal weights can be read.")
     points = np.asarray(surface["control_points"]["points"], dtype=float)
     control_points = points.reshape(surface["size_u"], surface["size_v"], -1)
     knots = [np.asarray(surface[f"knotvector_{which}"], dtype=float) for which in "uv"]

@@ -29,10 +29,10 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
         for number, line in enumerate(text.splitlines(), start=1)
         if (stripped := line.strip()) and not stripped.startswith("#")
     ]
-    if lines and _is_header(lines[0][1]):
-        lines = lines[1:]
+    names = lines.pop(0)[1].split(delimiter) if lines and _is_header(lines[0][1]) else []
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
+    _check_commas(path, [line for _, line in lines], delimiter, len(names))
     try:
         values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=(0, 1, 2))
     except ValueError as error:
@@ -45,7 +45,35 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
             f"coordinates, the first in line {lines[int(np.argmin(good))][0]}; remove or repair "
             "them."
         )
+    _check_first_column(path, values[:, 0], len(lines[0][1].split("#")[0].split(delimiter)))
     return values
+
+
+def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: int) -> None:
+    """Raise where commas may be those of decimals.
+
+    They are, between blanks or semicolons. They may be in six columns of nothing but digits, or in as many
+    as change from line to line, unless the first line names as many columns.
+    """
+    remedy = "write decimals with points, as 1.5"
+    cells = re.split(r"[;\s]+", lines[0].split("#")[0].strip())
+    found = len(cells) > 1 and any(re.fullmatch(r"[+-]?\d*,\d+", cell) for cell in cells)
+    if not found and delimiter:
+        columns = {len(line.split(delimiter)) for line in lines}
+        suspicious = columns != {named} and (columns == {6} or len(columns) > 1)
+        found = suspicious and not any(re.search(r"[^-+\d,\s]", line) for line in lines)
+        remedy += ", or if these are whole numbers, give every line as many and name them in the first"
+    if found:
+        raise InputError(f"{path} seems to hold decimal commas ({lines[0].strip()}); {remedy}.")
+
+
+def _check_first_column(path: Path, first: np.ndarray, columns: int) -> None:
+    """Raise if the first of four or more columns only counts the points, from 0 or 1."""
+    if columns >= 4 and len(first) >= 4 and first[0] in (0, 1) and (np.diff(first) == 1).all():
+        raise InputError(
+            f"{path}: the first column only counts the points, from {first[0]:.0f} to {first[-1]:.0f}; "
+            "remove it, so that x, y and z come first."
+        )
 
 
 def _is_header(line: str) -> bool:

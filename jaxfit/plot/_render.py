@@ -5,18 +5,21 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfit._base._host_splines import basis_matrix
 from jaxfit._splines import BSplineSurface
 from jaxfit.plot._view import View, choose_view
 
 _PIXELS = 1400  # longer side of the raw picture, which is halved in the end
 _COARSE = 129  # surface points per direction that choose view and density
 _DENSITY = 1.2  # surface points per raw pixel, per direction
-_MOST = 2000  # surface points per direction, whatever the density asks for
+_MOST = 1700  # surface points per direction, whatever the density asks for
 _KNOT_LINES = 14  # at most, per direction
+_DEPTHS = 16  # steps of depth per raw pixel
+_INDEX_BITS = 32
 
 _PLAIN = np.array([0.84, 0.80, 0.72])
 _HEIGHTS = np.array([[0.47, 0.57, 0.44], [0.80, 0.77, 0.60], [0.70, 0.57, 0.45], [0.96, 0.94, 0.91]])
-_LINE = np.array([0.13, 0.25, 0.40])
+_LINE = np.array([0.13, 0.25, 0.40], np.float32)
 _LIGHT = np.array([-0.68, 0.42, 0.60])  # from the upper left, in front of the picture
 
 
@@ -37,35 +40,58 @@ def render(
     size = np.ptp(seen[..., :2].reshape(-1, 2), axis=0).max()
     pixel = max(size, np.finfo(float).tiny) / (_PIXELS - 1)
     us, vs = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
-    xyz = _points(surface, us, vs)
-    seen = view(xyz)
+    # The view is affine: applied to the control points, it applies to the surface.
+    net = (view(_net(surface)) - seen.reshape(-1, 3).min(axis=0)) / pixel
+    points = _Samples(surface, us, vs)
+    keys = _nearest(*(points(net[..., c]) for c in range(3)))
+    filled = keys >= 0
+    index = keys[filled] & ((1 << _INDEX_BITS) - 1)
+    image = np.zeros((*keys.shape, 4), np.float32)
+    image[filled, 3] = 1.0
     if paint is not None:
-        colour = paint(us, vs)
+        image[filled, :3] = paint(us, vs).reshape(-1, 3)[index]
     else:
-        colour = _ground(xyz, view) * _shade(seen)[..., None]
-        _draw_knot_lines(colour, surface, us, vs)
-    image = _halve(_splat(seen.reshape(-1, 3), np.clip(colour, 0, 1).reshape(-1, 3), pixel))
-    return _pad(image, aspect), view
+        colour = _ground(_heights(surface, view, points, index), len(index))
+        colour *= _shade(net, points).ravel()[index, None]
+        for knots, at, number in zip(
+            (surface.knots_u, surface.knots_v), (us, vs), np.divmod(index, len(vs)), strict=True
+        ):
+            near = _near_a_knot(np.asarray(knots, dtype=float), at)[number]
+            colour[near] = 0.5 * colour[near] + 0.5 * _LINE
+        image[filled, :3] = np.clip(colour, 0, 1)
+    return _pad(_halve(image), aspect), view
+
+
+class _Samples:
+    """Splines on the knots of a surface, and their derivatives, on one grid of parameters.
+
+    By dense matrices in single precision, which is faster than looking up the span of each sample.
+    """
+
+    def __init__(self, surface: BSplineSurface, us: np.ndarray, vs: np.ndarray, dtype: type = np.float32):
+        self._dtype = dtype
+        self._u, self._v = (
+            [basis_matrix(np.asarray(knots, float), order, at, k).astype(dtype) for k in (0, 1)]
+            for knots, order, at in zip(
+                (surface.knots_u, surface.knots_v), surface.order, (us, vs), strict=True
+            )
+        )
+
+    def __call__(self, net: Float[np.ndarray, "nu nv"], du: int = 0, dv: int = 0) -> Float[np.ndarray, "a b"]:
+        return self._u[du] @ net.astype(self._dtype) @ self._v[dv].T
 
 
 def coarse_points(surface: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evenly spaced parameters along u and along v, and the points there: enough to choose a view."""
-    (u0, u1), (v0, v1) = surface.domain
-    us, vs = np.linspace(u0, u1, _COARSE), np.linspace(v0, v1, _COARSE)
-    return us, vs, _points(surface, us, vs)
+    us, vs = (np.linspace(float(low), float(high), _COARSE) for low, high in surface.domain)
+    points, net = _Samples(surface, us, vs, float), _net(surface)
+    return us, vs, np.stack([points(net[..., c]) for c in range(3)], axis=-1)
 
 
-def _draw_knot_lines(colour: np.ndarray, surface: BSplineSurface, us: np.ndarray, vs: np.ndarray) -> None:
-    for axis, (knots, at) in enumerate(((surface.knots_u, us), (surface.knots_v, vs))):
-        line = np.moveaxis(colour, axis, 0)  # a view: drawing on it draws on `colour`
-        near = _near_a_knot(np.asarray(knots, dtype=float), at)
-        line[near] = 0.5 * line[near] + 0.5 * _LINE
-
-
-def _points(surface: BSplineSurface, us: np.ndarray, vs: np.ndarray) -> np.ndarray:
-    """Surface points, cut or filled with zeros to three coordinates."""
-    xyz = np.asarray(surface.grid(us, vs), dtype=float)
-    return np.concatenate([xyz, np.zeros((*xyz.shape[:2], 3))], axis=-1)[..., :3]
+def _net(surface: BSplineSurface) -> Float[np.ndarray, "nu nv 3"]:
+    """Control points, cut or filled with zeros to three coordinates."""
+    net = np.asarray(surface.control_points, dtype=float)
+    return np.concatenate([net, np.zeros((*net.shape[:2], 3))], axis=-1)[..., :3]
 
 
 def _refine(at: np.ndarray, seen: np.ndarray, pixel: float) -> np.ndarray:
@@ -76,74 +102,84 @@ def _refine(at: np.ndarray, seen: np.ndarray, pixel: float) -> np.ndarray:
     return np.interp(np.linspace(0, along[-1], count), along, at)
 
 
-def _ground(xyz: np.ndarray, view: View) -> np.ndarray:
-    """One colour, or colours by height for a relief."""
+def _heights(surface: BSplineSurface, view: View, points: _Samples, index: np.ndarray) -> np.ndarray | None:
+    """Heights from 0 to 1 of a relief at the samples `index`; None for any other surface."""
     if not view.relief:
-        return np.broadcast_to(_PLAIN, xyz.shape)
-    height = xyz[..., "xyz".index(view.relief)]
-    height = (height - height.min()) / max(np.ptp(height), np.finfo(float).tiny)
+        return None
+    net = _net(surface)[..., "xyz".index(view.relief)]
+    height = points(net - net.min())
+    height = (height - height.min()) / max(np.ptp(height), np.finfo(np.float32).tiny)
+    return height.ravel()[index]
+
+
+def _ground(heights: np.ndarray | None, count: int) -> Float[np.ndarray, "count 3"]:
+    """One colour, or colours by height for a relief."""
+    if heights is None:
+        return np.tile(_PLAIN.astype(np.float32), (count, 1))
     stops = np.linspace(0, 1, len(_HEIGHTS))
-    return np.stack([np.interp(height, stops, channel) for channel in _HEIGHTS.T], axis=-1)
+    channels = [np.interp(heights, stops, channel) for channel in _HEIGHTS.T]
+    return np.stack(channels, axis=-1).astype(np.float32)
 
 
-def _shade(seen: np.ndarray) -> np.ndarray:
+def _shade(net: Float[np.ndarray, "nu nv 3"], points: _Samples) -> Float[np.ndarray, "a b"]:
     """Brightness by the angle to the light; both sides are lit."""
-    normal = np.cross(np.gradient(seen, axis=0), np.gradient(seen, axis=1))
-    length = np.linalg.norm(normal, axis=-1)
-    cosine = normal @ (_LIGHT / np.linalg.norm(_LIGHT)) / np.where(length > 0, length, 1.0)
-    cosine = np.where(normal[..., 2] < 0, -cosine, cosine)
+    along_u, along_v = ([points(net[..., c], *which) for c in range(3)] for which in ((1, 0), (0, 1)))
+    normal = [along_u[b] * along_v[c] - along_u[c] * along_v[b] for b, c in ((1, 2), (2, 0), (0, 1))]
+    length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+    light = _LIGHT / np.linalg.norm(_LIGHT)
+    cosine = sum(float(a) * x for a, x in zip(light, normal, strict=True))
+    cosine = np.copysign(1.0, normal[2]) * cosine / np.where(length > 0, length, 1.0)
     # The square keeps some shape in the shade, where Lambert's law has none.
     return 0.2 + 0.95 * (0.5 + 0.5 * cosine) ** 2
 
 
 def _near_a_knot(knots: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Indices into `at` next to evenly chosen knots; the ends of the domain always count."""
+    """Which of `at` are next to evenly chosen knots; the ends of the domain always count."""
     knots = np.unique(np.clip(knots, at[0], at[-1]))
     every = -(-(len(knots) - 1) // _KNOT_LINES)
     nearest = np.searchsorted(at, np.append(knots[:-1:every], knots[-1]))
-    return np.unique(np.clip(nearest[:, None] + np.arange(-1, 2), 0, len(at) - 1))
+    near = np.zeros(len(at), bool)
+    near[np.clip(nearest[:, None] + np.arange(-1, 2), 0, len(at) - 1)] = True
+    return near
 
 
-def _splat(seen: np.ndarray, colour: np.ndarray, pixel: float) -> np.ndarray:
-    low = seen[:, :2].min(axis=0)
-    column, row = (np.rint((seen[:, :2] - low) / pixel).astype(np.int64) + 2).T
-    width, height = column.max() + 3, row.max() + 3
-    order = np.argsort(seen[:, 2])
-    # Of several points in a pixel the last one stays, and that is the nearest.
-    rank = np.full((height, width), -1)
-    rank[height - 1 - row[order], column[order]] = np.arange(len(order))
+def _nearest(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Int[np.ndarray, "height width"]:
+    """For every raw pixel a key of the sample in front: its depth in the upper bits, its index in the
+    lower ones. -1 is an empty pixel.
+    """
+    column = np.rint(x + (2 - x.min())).astype(np.int32)
+    row = np.rint((y.max() + 2) - y).astype(np.int32)
+    width, height = int(column.max()) + 3, int(row.max()) + 3
+    depth = ((z - z.min()) * _DEPTHS).astype(np.int64).ravel()
+    keys = np.full((height, width), -1)
+    np.maximum.at(
+        keys.ravel(), (row * width + column).ravel(), (depth << _INDEX_BITS) + np.arange(depth.size)
+    )
     for _ in range(2):
-        rank = _close_gaps(rank, seen[order, 2], 4 * pixel)
-    image = np.zeros((height, width, 4))
-    filled = rank >= 0
-    image[filled, :3] = colour[order[rank[filled]]]
-    image[filled, 3] = 1.0
-    return image
+        keys = _close_gaps(keys)
+    return keys
 
 
-def _close_gaps(
-    rank: Int[np.ndarray, "height width"], depth: Float[np.ndarray, "samples"], step: float
-) -> Int[np.ndarray, "height width"]:
+def _close_gaps(keys: Int[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
     """Fill a pixel, or cover what shows through it from behind, with its nearest neighbour.
 
-    Ranks order the samples from far to near, -1 is an empty pixel. Only pixels with neighbours on
-    opposite sides count as gaps, so that outlines do not grow.
+    Only pixels with neighbours on opposite sides count as gaps, so that outlines do not grow.
     """
-    height, width = rank.shape
-    padded = np.pad(rank, 1, constant_values=-1)
-    best = np.full_like(rank, -1)
+    height, width = keys.shape
+    padded = np.pad(keys, 1, constant_values=-1)
+    best = np.full_like(keys, -1)
     for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
         ahead = padded[1 + di : 1 + di + height, 1 + dj : 1 + dj + width]
         behind = padded[1 - di : 1 - di + height, 1 - dj : 1 - dj + width]
         best = np.maximum(best, np.minimum(ahead, behind))
-    covered = (best >= 0) & ((rank < 0) | (depth[best] - depth[rank] > step))
-    return np.where(covered, best, rank)
+    step = (4 * _DEPTHS) << _INDEX_BITS
+    return np.where((best >= 0) & ((keys < 0) | (best - keys > step)), best, keys)
 
 
 def _halve(image: np.ndarray) -> np.ndarray:
     """Mean of 2 x 2 pixels, which smooths edges; colours count by their opacity."""
     image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)))
-    small = image.reshape(image.shape[0] // 2, 2, image.shape[1] // 2, 2, 4).mean(axis=(1, 3))
+    small = 0.25 * (image[::2, ::2] + image[1::2, ::2] + image[::2, 1::2] + image[1::2, 1::2])
     small[..., :3] /= np.where(small[..., 3:] > 0, small[..., 3:], 1.0)
     return small
 

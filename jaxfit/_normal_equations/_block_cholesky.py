@@ -30,13 +30,13 @@ class Factors(eqx.Module):
     """By rows of the net: `inverse[i]` of block D of row i, and `below[i]`, the K - 1 blocks of X after it.
 
     `shift` is the share of the diagonal that had to be added: 0 unless the matrix is nearly singular.
-    Where `turned`, the directions of the net are exchanged.
+    Where `transposed`, the directions of the net are exchanged.
     """
 
     inverse: Float[Array, "rows n n"]
     below: Float[Array, "rows m n"]
     shift: Float[Array, ""]
-    turned: bool = eqx.field(static=True)
+    transposed: bool = eqx.field(static=True)
 
 
 def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
@@ -45,8 +45,8 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
     A matrix that is nearly singular is shifted by a small multiple of its diagonal. Time
     O(rows (K n)^2 n) and memory O(rows K n^2), n being the shorter side of the net.
     """
-    turned = free.shape[1] > free.shape[0]
-    if turned:
+    transposed = free.shape[1] > free.shape[0]
+    if transposed:
         stencil, free = stencil.transposed(), free.T
     entries = jnp.asarray(stencil.entries)
     eps = float(jnp.finfo(entries.dtype).eps)
@@ -67,7 +67,7 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
     blocks = (jnp.zeros((nu, nv, nv), entries.dtype), jnp.zeros((nu, reach, nv), entries.dtype), zero)
     begin = (blocks, zero, jnp.asarray(0, jnp.int32))
     (inverse, below, _), shift, _ = lax.while_loop(failed, attempt, begin)
-    return Factors(inverse, below, shift, turned)
+    return Factors(inverse, below, shift, transposed)
 
 
 def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, Array]:
@@ -130,7 +130,7 @@ def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
 
 def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array, "nu nv c"]:
     """The solution with the factors, forward and backward; control points not free get their right side."""
-    if factors.turned:
+    if factors.transposed:
         right = right.transpose(1, 0, 2)
     reach = factors.below.shape[1]
     count, channels = right.shape[1:]
@@ -148,4 +148,4 @@ def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array,
     none = jnp.zeros((reach, channels), right.dtype)
     _, half = lax.scan(forward, none, (factors.below, right))
     _, whole = lax.scan(backward, none, (factors.inverse, factors.below, half), reverse=True)
-    return whole.transpose(1, 0, 2) if factors.turned else whole
+    return whole.transpose(1, 0, 2) if factors.transposed else whole

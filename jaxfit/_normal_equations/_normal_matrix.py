@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._cells import Rows
-from jaxfit._normal_equations._stencil import Stencil, overlapped
+from jaxfit._normal_equations._stencil import Stencil, overlap_add, windows
 from jaxfit._splines._pieces import Axis
 
 # Powers of so many points are held at once, 112 bytes each for bicubic: within the caches' reach, and large
@@ -40,7 +40,7 @@ def normal_stencil(
         moments = _cell_moments(rows.cell, s, t, weight, size, cells)
     else:
         moments = _in_blocks(rows, s, t, weight, size, cells, at_once)
-    return _to_stencil(moments, axis_u, axis_v)
+    return Stencil(entries_of_moments(moments.reshape(cells, *size, 1), axis_u, axis_v)[0])
 
 
 def _in_blocks(
@@ -80,23 +80,28 @@ def powers(x: Float[Array, "rows width"], count: int) -> Float[Array, "count row
     return jnp.stack(each)
 
 
-def _to_stencil(moments: Float[Array, "cells moments"], axis_u: Axis, axis_v: Axis) -> Stencil:
-    """One direction at a time: moments into entries for the basis functions of a span, spans overlapped."""
-    x = moments.reshape(axis_u.cells, axis_v.cells, 2 * _order(axis_u) - 1, 2 * _order(axis_v) - 1)
-    along_v = jnp.einsum("qsfb,pqab->sfapq", basis_products(axis_v), x)
-    x = overlapped(list(along_v), axis_v.cells + _order(axis_v) - 1, -1)
-    along_u = jnp.einsum("prea,fapj->refpj", basis_products(axis_u), x)
-    return Stencil(overlapped(list(along_u), axis_u.cells + _order(axis_u) - 1, -2))
+def entries_of_moments(
+    moments: Float[Array, "cells A B m"], axis_u: Axis, axis_v: Axis
+) -> Float[Array, "m K L nu nv"]:
+    """Entries of a stencil for each of m weights, from the cells' (2K - 1) x (2L - 1) moments.
+
+    One direction at a time: moments into entries for the basis functions of a span, then spans overlapped.
+    """
+    x = moments.reshape(axis_u.cells, axis_v.cells, *moments.shape[1:])
+    along_u = jnp.einsum("prea,pqabm->rpeqbm", basis_products(axis_u), x, precision="highest")
+    x = overlap_add(along_u, 0)
+    along_v = jnp.einsum("qsfb,ieqbm->sqfiem", basis_products(axis_v), x, precision="highest")
+    return overlap_add(along_v, 0).transpose(4, 3, 1, 2, 0)
 
 
-def basis_products(axis: Axis) -> Float[Array, "cells K K moments"]:
+def basis_products(axis: Axis) -> Float[Any, "cells K K moments"]:
     """N_r N_(r + e) of every span as polynomials, `[span, r, e]`; zero where r + e has no function there."""
-    polynomials = jnp.asarray(axis.polynomials)
-    order = polynomials.shape[1]
-    shifted = jnp.pad(polynomials, ((0, 0), (0, order - 1), (0, 0)))
-    neighbours = jnp.stack([shifted[:, e : e + order] for e in range(order)], axis=2)
-    terms: list[Any] = [polynomials[:, :, None, a, None] * neighbours for a in range(order)]
-    return overlapped(terms, 2 * order - 1, -1)
+    basis = axis.polynomials
+    order = _order(axis)
+    xp: Any = np if isinstance(basis, np.ndarray) else jnp
+    shifted = xp.pad(basis, ((0, 0), (0, order - 1), (0, 0)))
+    neighbours = xp.moveaxis(windows(shifted, order, order, 1), 0, 2)
+    return overlap_add(xp.moveaxis(basis, 2, 0)[:, :, :, None, None] * neighbours[None], -1)
 
 
 def _order(axis: Axis) -> int:

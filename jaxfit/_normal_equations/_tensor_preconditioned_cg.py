@@ -4,13 +4,14 @@ from typing import Any
 
 import jax.numpy as jnp
 import lineax as lx
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
 
+from jaxfit._normal_equations._conjugate_gradients import conjugate_gradients
 from jaxfit._splines import _banded
 
 
-class TensorCG(lx.AbstractLinearSolver):
+class TensorPreconditionedCG(lx.AbstractLinearSolver):
     """Conjugate gradients on a `NormalOperator`, in memory of the size of the net.
 
     Preconditioned by D^(1/2) (T_u x T_v) D^(1/2), with the diagonal D and the mean over all rows and over
@@ -31,29 +32,14 @@ class TensorCG(lx.AbstractLinearSolver):
         del options
         operator, factors = state
 
-        def inner(x: Array, y: Array) -> Array:
-            return jnp.sum(x * y, axis=(0, 1), keepdims=True)
+        def preconditioner(x: Array) -> Array:
+            return _preconditioned(factors, x)
 
-        def unfinished(carry: Any) -> Array:
-            _, left, _, _, steps = carry
-            return jnp.any(inner(left, left) > goal) & (steps < self.max_steps)
-
-        def step(carry: Any) -> Any:
-            net, left, along, slope, steps = carry
-            image = operator.mv(along)
-            length = _over(slope, inner(along, image))
-            net, left = net + length * along, left - length * image
-            preconditioned = _preconditioned(factors, left)
-            after = inner(left, preconditioned)
-            return net, left, preconditioned + _over(after, slope) * along, after, steps + 1
-
-        goal = self.rtol**2 * inner(vector, vector)
-        first = _preconditioned(factors, vector)
-        begin = (jnp.zeros_like(vector), vector, first, inner(vector, first), jnp.asarray(0, jnp.int32))
-        net, _, _, _, steps = lax.while_loop(unfinished, step, begin)
-        met = steps < self.max_steps
-        result = lx.RESULTS.where(met, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
-        return net, result, {"num_steps": steps, "max_steps": self.max_steps}
+        found = conjugate_gradients(
+            operator.mv, vector, preconditioner, self.rtol, self.max_steps, coupled=False
+        )
+        result = lx.RESULTS.where(found.met, lx.RESULTS.successful, lx.RESULTS.max_steps_reached)
+        return found.net, result, {"num_steps": found.steps, "max_steps": self.max_steps}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
         """The matrix is symmetric."""
@@ -66,11 +52,6 @@ class TensorCG(lx.AbstractLinearSolver):
     def assume_full_rank(self) -> bool:
         """CG stays within the range of a singular matrix, where the right-hand sides of fits lie."""
         return True
-
-
-def _over(x: Array, y: Array) -> Array:
-    """x / y; 0 where y is 0, as for a channel that is solved exactly."""
-    return jnp.where(y > 0, x / jnp.where(y > 0, y, 1.0), 0.0)
 
 
 def _preconditioned(factors: tuple[Array, Any, Any], x: Float[Array, "nu nv c"]) -> Float[Array, "nu nv c"]:

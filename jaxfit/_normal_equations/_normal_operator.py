@@ -9,9 +9,9 @@ import lineax as lx
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._normal_equations._elimination import Factors, factorise, substitute
+from jaxfit._normal_equations._block_cholesky import Factors, factorise, substitute
 from jaxfit._normal_equations._stencil import Stencil
-from jaxfit._normal_equations._tensor_cg import TensorCG
+from jaxfit._normal_equations._tensor_preconditioned_cg import TensorPreconditionedCG
 
 # Factors of more numbers than this (512 MiB in double precision) are not stored: CG takes over.
 MOST_FACTORS = 1 << 26
@@ -103,8 +103,8 @@ class BlockCholesky(lx.AbstractLinearSolver):
         return True
 
 
-def normal_solver(operator: NormalOperator) -> BlockCholesky | TensorCG:
+def normal_solver(operator: NormalOperator) -> BlockCholesky | TensorPreconditionedCG:
     """Block Cholesky while its factors fit in memory comfortably, CG beyond."""
     order_u, order_v, nu, nv = operator.stencil.entries.shape
     size = nu * order_u * nv**2 if nv <= nu else nv * order_v * nu**2
-    return BlockCholesky() if size <= MOST_FACTORS else TensorCG()
+    return BlockCholesky() if size <= MOST_FACTORS else TensorPreconditionedCG()

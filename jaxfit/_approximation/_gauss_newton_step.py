@@ -1,0 +1,67 @@
+"""The step of orthogonal distance: a damped Gauss-Newton step and its correction of second order."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._approximation._damping import within_reach
+from jaxfit._approximation._distance_rows import NormalEquations
+from jaxfit._normal_equations import Stencil, coupled_preconditioner, free_points, solve_coupled, thin_plate
+from jaxfit._splines._pieces import Axis
+
+RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
+MOST_STEPS = 60  # of conjugate gradients
+LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
+
+
+def gauss_newton_step(
+    axes: tuple[Axis, Axis],
+    smoothing: Any,
+    reach: float,
+    correction_rhs: Callable[[Array, Array], Array],
+    equations: NormalEquations,
+    net: Float[Array, "nu nv d"],
+    held: Bool[Array, "nu nv"],
+    damping: Float[Array, ""],
+) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
+    """The net after the step, and by how much the objective should fall.
+
+    `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
+    damping 1 there is none.
+    """
+    plate = thin_plate(*axes)
+    stiffness = plate.stencil()
+    matrix = equations.matrix.plus(stiffness, smoothing)
+    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
+    scale = 1.0 + (net.shape[2] - 1) * damping
+    uncoupled = Stencil(equations.matrix.trace.entries / scale).plus(stiffness, smoothing)
+    free = free_points(uncoupled, held)
+    right = equations.gradient - smoothing * plate.adjoint(plate.residual(net))
+    right = jnp.where(free[:, :, None], right, 0.0)
+    preconditioner = coupled_preconditioner(matrix, uncoupled, free)
+    corrected = damping < 1
+
+    def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
+        """The move, and then its correction, whose right-hand side depends on the move."""
+        rhs = lax.cond(
+            is_step,
+            lambda: right,
+            lambda: lax.cond(corrected, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
+        )
+        solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, MOST_STEPS).net
+        limited = jnp.where(corrected, within_reach(net, solution, reach), solution)
+        return jnp.where(is_step, limited, move), solution
+
+    move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
+    predicted = jnp.sum(move * (2.0 * right - matrix(move)))
+    whole = within_reach(net, move + _at_most(LARGEST_CORRECTION, correction, move), reach)
+    return net + jnp.where(corrected, whole, move), predicted
+
+
+def _at_most(share: float, correction: Array, move: Array) -> Array:
+    """The correction, no longer than a share of the move."""
+    length, most = jnp.sqrt(jnp.sum(correction**2)), share * jnp.sqrt(jnp.sum(move**2))
+    return jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0) * correction

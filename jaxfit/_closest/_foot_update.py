@@ -1,0 +1,61 @@
+"""Feet brought up to date with a surface that has moved, and sums over the points at them."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._closest._feet import FOUND, SUMMED_FOUND, Limits
+from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._iterate_feet import PointSums, iterate_feet
+from jaxfit._closest._project import Border, initial_feet
+from jaxfit._splines._pieces import Pieces
+
+MAX_STEPS = 40
+
+
+class FootUpdate(eqx.Module):
+    """Feet and the lengths of their residuals, which are 0 for idle points."""
+
+    u: Float[Array, " points"]
+    v: Float[Array, " points"]
+    error: Float[Array, " points"]
+    evaluations: Int[Array, " points"]
+    converged: Bool[Array, " points"]
+
+
+def update_feet(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Float[Array, "d points"],
+    u: Float[Array, " points"],
+    v: Float[Array, " points"],
+    tolerance: Float[Array, ""],
+    *,
+    idle: Bool[Array, " points"],
+    max_steps: Any = MAX_STEPS,
+    single_step: Any = False,
+    within: Border | None = None,
+    sums: PointSums | None = None,
+    weight: Float[Array, " points"] | None = None,
+) -> tuple[FootUpdate, Any]:
+    r"""Local feet of `target` from the last ones (u, v), and what `sums` makes of the residuals there.
+
+    `tolerance` is the largest tangential part of a residual, a length; `idle` points stay where they are and
+    take no part. `within` are bounds (low_u, high_u, low_v, high_v) of every foot's own. `weight` is what a
+    point counts in the sums, 1 without it. Feet that are not found within `max_steps` evaluations count by
+    the best there is.
+
+    Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
+    \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.
+    """
+    pieces = jax.tree.map(jnp.asarray, pieces)
+    limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
+    done = FOUND if sums is None else SUMMED_FOUND
+    feet, bounds = initial_feet(pieces, u, v, idle, within, done)
+    feet, found = iterate_feet(method, pieces, target, feet, limits, bounds, sums, weight, single_step)
+    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
+    return FootUpdate(feet.best_u, feet.best_v, error, feet.steps, feet.converged), found

@@ -1,0 +1,88 @@
+"""Inner products of the residual and the derivatives at a foot, which every step is made of.
+
+Vectors are arrays (k, d, slots), what belongs to both parameters arrays (2, slots), numbers (1, slots): so an
+operation serves both parameters, and nothing is broadcast.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from jaxfit._barrier import materialise
+from jaxfit._cells import evaluate_jet
+
+
+class Expansion(eqx.Module):
+    """The residual e = Q - R and the derivatives of the surface to second order, in local coordinates."""
+
+    e: Float[Array, "1 d slots"]
+    first: Float[Array, "2 d slots"]  # R_s, R_t
+    second: Float[Array, "3 d slots"]  # R_ss, R_tt, R_st
+
+
+class Forms(eqx.Module):
+    """Inner products at the current feet."""
+
+    f: Float[Array, "1 slots"]  # squared distance e . e
+    gradient: Float[Array, "2 slots"]  # e . R_s and e . R_t, half the fall of f
+    metric: Float[Array, "2 slots"]  # E and G of the first fundamental form
+    skew: Float[Array, "1 slots"]  # F of the first fundamental form
+    bend: Float[Array, "3 slots"]  # e . R_ss, e . R_tt, e . R_st
+    drift: Float[Array, "3 2 slots"] | None = None  # second times first derivatives, where a method asks
+
+    @property
+    def hessian(self) -> tuple[Float[Array, "2 slots"], Float[Array, "1 slots"]]:
+        """Diagonal and off-diagonal entry of the Hessian of f / 2."""
+        return self.metric - self.bend[:2], self.skew - self.bend[2:]
+
+
+def expand(
+    always: Bool[Array, ""],
+    coefficients: Float[Array, "rows d K L"],
+    local: Float[Array, "2 slots"],
+    target: Float[Array, "1 d slots"],
+) -> Expansion:
+    """The surface around every slot's local coordinates; the slots of all rows lie in one line."""
+    rows = local.reshape(2, coefficients.shape[0], -1)
+    jet = materialise(always, lambda c, x: evaluate_jet(c, x[0], x[1]), coefficients, rows)
+    value, s, t, ss, st, tt = (x.reshape(target.shape) for x in jet)
+    return Expansion(target - value, jnp.concatenate([s, t]), jnp.concatenate([ss, tt, st]))
+
+
+def inner_products(at: Expansion, drift: bool) -> Forms:
+    """All inner products; with `drift` those that Hu and Wallner's step needs besides."""
+    e, first, second = at.e, at.first, at.second
+    return Forms(
+        f=(e * e).sum(1),
+        gradient=(e * first).sum(1),
+        metric=(first * first).sum(1),
+        skew=(first[:1] * first[1:]).sum(1),
+        bend=(e * second).sum(1),
+        drift=(second[:, None] * first[None]).sum(2) if drift else None,
+    )
+
+
+def product(x: Float[Array, "2 slots"]) -> Float[Array, "1 slots"]:
+    """The product of both entries."""
+    return x[:1] * x[1:]
+
+
+def total(x: Float[Array, "k slots"]) -> Float[Array, "1 slots"]:
+    """The sum of all entries."""
+    return x.sum(0)[None]
+
+
+def either(x: Bool[Array, "2 slots"]) -> Bool[Array, "1 slots"]:
+    """Whether one of both holds."""
+    return x[:1] | x[1:]
+
+
+def both(x: Bool[Array, "2 slots"]) -> Bool[Array, "1 slots"]:
+    """Whether both hold."""
+    return x[:1] & x[1:]
+
+
+def dot(a: Float[Array, "d ..."], b: Float[Array, "d ..."]) -> Float[Array, "..."]:
+    """Inner product along the first axis."""
+    return (a * b).sum(0)

@@ -1,0 +1,219 @@
+"""Feet moved on in passes: points laid out in rows of one cell, a block of rows at a time.
+
+A pass lays out the feet that are still going and takes a few steps with each, on the polynomial of the cell
+it is in. Feet change cells, so the next pass lays them out anew; the first holds nearly all points, the
+last ones a few stragglers. What a caller sums over the points is taken in the pass that finds their feet.
+"""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._cells import (
+    SLOTS_PER_BLOCK,
+    Rows,
+    make_rows,
+    make_single_rows,
+    narrow_width,
+    over_blocks,
+    row_coefficients,
+)
+from jaxfit._closest._bounds import Bounds, bounds_of_cells, bounds_of_slots
+from jaxfit._closest._feet import FOUND, GOING, SUMMED_FOUND, SUMMED_GIVEN_UP, Feet, Limits, is_going
+from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._safeguarded_step import Mode, MovingFeet, advance
+from jaxfit._closest._smooth_regions import SmoothRegion, cells_of_regions, cross_creases, initial_region
+from jaxfit._closest._taylor_projection import third_derivatives
+from jaxfit._splines._pieces import Pieces
+
+# So many steps in a row where rows hold several points, as long as one of so many feet of a block is going.
+STEPS_PER_PASS = 3
+ONE_OF = 3
+# A block on a CPU is too little to be shared among cores, which costs more than it gains; whole clouds are
+# shared instead.
+ROWS_PER_BLOCK = 2048
+# Below this many points, or points per cell, rows of several points are too empty to pay.
+SHARED_FROM_POINTS = 4096
+SHARED_FROM_FILL = 2
+
+
+class PointSums(eqx.Module):
+    """What to sum over the points at their feet."""
+
+    @abstractmethod
+    def begin(self, pieces: Pieces) -> Any:
+        """The sums over no points, for each cell."""
+
+    @abstractmethod
+    def add(
+        self,
+        total: Any,
+        part: Rows,
+        s: Float[Array, "rows width"],
+        t: Float[Array, "rows width"],
+        e: Float[Array, "d rows width"],
+        weight: Float[Array, "rows width"],
+    ) -> Any:
+        """With what some rows add: points with local coordinates (s, t) and residuals e = Q - R.
+
+        Slots whose weight and residual are zero hold no point.
+        """
+
+    @abstractmethod
+    def finish(self, total: Any, pieces: Pieces) -> Any:
+        """What the caller gets."""
+
+
+def iterate_feet(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Float[Array, "d points"],
+    feet: Feet,
+    limits: Limits,
+    border: Float[Array, "2 2 _"] | None = None,
+    sums: PointSums | None = None,
+    weight: Float[Array, " points"] | None = None,
+    single_step: Any = False,
+) -> tuple[Feet, Any]:
+    """Passes until no foot is going, and the sums.
+
+    `border` are bounds narrower than the domain (lower and upper, u and v), of all points or of each. Feet
+    that are not found take part in the sums by their best. With `single_step` every foot takes one step, and
+    the residual that this predicts.
+    """
+    creased = pieces.axis_u.creased or pieces.axis_v.creased
+    region = initial_region(pieces, feet) if creased else None
+    total = None if sums is None else sums.begin(pieces)
+    cells = bounds_of_cells(pieces, third_derivatives(pieces))
+
+    def waiting(feet: Feet) -> Bool[Array, " points"]:
+        return is_going(feet, limits) if sums is None else feet.state < SUMMED_FOUND
+
+    def one(carry: tuple[Feet, SmoothRegion | None, Any]) -> tuple[Feet, SmoothRegion | None, Any]:
+        feet, region, total = carry
+        which, mode = is_going(feet, limits), None
+        if sums is not None:  # a last pass sums over feet that are done, but not as certain
+            last = ~jnp.any(which)
+            mode = Mode(last | single_step, last)
+            which = (which | last) & waiting(feet)
+            feet = Feet(jnp.where(last, feet.real.at[:2].set(feet.real[2:4]), feet.real), feet.whole)
+        u, v = feet.trial
+        cell_u, cell_v = pieces.axis_u.locate(u), pieces.axis_v.locate(v)
+        if region is not None:
+            cell_u, cell_v = cells_of_regions(pieces, region, cell_u, cell_v)
+        cell = jnp.where(which, cell_u * pieces.axis_v.cells + cell_v, pieces.cells)
+        rows = _rows(cell, pieces.cells, sums is not None)
+        one_pass = _Pass(method, pieces, target, cells, limits, border, sums, weight, mode)
+        moved, total = one_pass(rows, feet, total)
+        if region is not None:
+            moved, region = cross_creases(pieces, feet, moved, region, limits)
+        return moved, region, total
+
+    begin = (feet, region, total)
+    feet, _, total = lax.while_loop(lambda carry: jnp.any(waiting(carry[0])), one, begin)
+    return feet, None if sums is None else sums.finish(total, pieces)
+
+
+def _rows(cell: Array, cells: int, summed: bool) -> Rows:
+    points = cell.shape[0]
+    shared = points >= SHARED_FROM_FILL * cells and (summed or points >= SHARED_FROM_POINTS)
+    return make_rows(cell, cells, narrow_width(points, cells)) if shared else make_single_rows(cell, cells)
+
+
+class _Pass(eqx.Module):
+    """A few steps for every foot in a row."""
+
+    method: AbstractFootMethod
+    pieces: Pieces
+    target: Float[Array, "d points"]
+    cells: Float[Array, "cells 11"]
+    limits: Limits
+    border: Float[Array, "2 2 _"] | None
+    sums: PointSums | None
+    weight: Float[Array, " points"] | None
+    mode: Mode | None
+
+    @property
+    def creased(self) -> bool:
+        """Whether feet may have to go on across a crease."""
+        return self.pieces.axis_u.creased or self.pieces.axis_v.creased
+
+    def __call__(self, rows: Rows, feet: Feet, total: Any) -> tuple[Feet, Any]:
+        """All rows, a block of them after the other."""
+        width = rows.point.shape[1]
+        slots = min(SLOTS_PER_BLOCK, ROWS_PER_BLOCK * width)
+        return over_blocks(rows, self._block, (feet, total), slots)
+
+    def _block(self, part: Rows, filled: Array, carry: tuple[Feet, Any]) -> tuple[Feet, Any]:
+        feet, total = carry
+        bounds, third = bounds_of_slots(self.cells, part, self.border)
+        mine, taking = self._begin(part, filled, feet)
+        moved = self._steps(part, mine, bounds, third)
+        if self.sums is not None:
+            before = part.spread(feet.whole[1:]).reshape(1, -1)
+            moved, total = self._sum(part, taking, before, moved, bounds, total)
+        real = jnp.concatenate([moved.trial, moved.best, moved.f])
+        whole = jnp.concatenate([moved.steps, moved.state])
+        point = jnp.where(taking[0], part.point.reshape(-1), part.points)
+        put = dict(mode="drop", wrap_negative_indices=False)
+        return Feet(feet.real.at[:, point].set(real, **put), feet.whole.at[:, point].set(whole, **put)), total
+
+    def _begin(self, part: Rows, filled: Array, feet: Feet) -> tuple[MovingFeet, Array]:
+        """The feet of a block, of which those that take part in this pass are going."""
+        slots = part.point.size
+        trial, best, f = lax.split(part.spread(feet.real).reshape(5, slots), (2, 2, 1))
+        steps, state = lax.split(part.spread(feet.whole).reshape(2, slots), (1, 1))
+        taking = filled.reshape(1, slots)
+        if self.mode is None:
+            taking &= (state == GOING) & (steps < self.limits.steps)
+            state = jnp.where(taking, state, FOUND)
+        else:
+            taking &= state < SUMMED_FOUND
+            state = jnp.where(taking, GOING, FOUND)
+        e = None if self.sums is None else jnp.zeros((1, self.target.shape[0], slots), f.dtype)
+        return MovingFeet(trial, best, f, steps, state, e), taking
+
+    def _steps(self, part: Rows, feet: MovingFeet, bounds: Bounds, third: Array) -> MovingFeet:
+        """The steps of a pass."""
+        coefficients = row_coefficients(self.pieces, part)
+        target = part.spread(self.target).reshape(1, -1, part.point.size)
+
+        def step(carry: tuple[Array, MovingFeet]) -> tuple[Array, MovingFeet]:
+            args = (target, coefficients, bounds, third, self.limits, self.creased, self.mode)
+            return carry[0] + 1, advance(self.method, carry[1], *args)
+
+        if part.point.shape[1] == 1:  # laying feet out anew costs less than moving some that are done
+            return step((jnp.zeros((), jnp.int32), feet))[1]
+
+        def goes_on(carry: tuple[Array, MovingFeet]) -> Array:
+            going = jnp.sum(carry[1].state == GOING, dtype=jnp.int32)
+            return (carry[0] < STEPS_PER_PASS) & ((ONE_OF * going > part.point.size) | (carry[0] == 0))
+
+        return lax.while_loop(goes_on, step, (jnp.zeros((), jnp.int32), feet))[1]
+
+    def _sum(
+        self, part: Rows, taking: Array, before: Array, feet: MovingFeet, bounds: Bounds, total: Any
+    ) -> tuple[MovingFeet, Any]:
+        """What those add that are done, and their state with that."""
+        assert self.sums is not None
+        assert self.mode is not None
+        assert feet.e is not None
+        found, done = feet.state == FOUND, taking & (feet.state == FOUND)
+        if self.creased:  # a foot at a bound may have to go on
+            done &= ~((feet.best <= bounds.low) | (feet.best >= bounds.high)).any(0)[None]
+        done |= taking & self.mode.single
+        found &= ~self.mode.fixed | (before == FOUND)
+        state = jnp.where(done, jnp.where(found, SUMMED_FOUND, SUMMED_GIVEN_UP), feet.state)
+        takes_part = done & jnp.isfinite(feet.f)
+        s, t = jnp.where(takes_part, lax.clamp(-1.0, bounds.local(feet.best), 1.0), 0.0).reshape(
+            2, *part.point.shape
+        )
+        e = jnp.where(takes_part, feet.e[0], 0.0).reshape(-1, *part.point.shape)
+        weight = takes_part.reshape(part.point.shape).astype(e.dtype)
+        if self.weight is not None:
+            weight *= part.spread(self.weight[None])[0]
+        return feet._replace(state=state), self.sums.add(total, part, s, t, e, weight)

@@ -1,0 +1,70 @@
+"""Feet on creases: one that has been found there tries the smooth regions on its other sides.
+
+A smooth region is what lies between neighbouring creases, in both directions. A foot stays within its own
+until it finds a nearer foot across a crease.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxfit._cells import take
+from jaxfit._closest._feet import FOUND, GOING, Feet, Limits
+from jaxfit._splines._pieces import Axis, Pieces
+
+LAST_TRY = 3
+
+
+class SmoothRegion(eqx.Module):
+    """The smooth region of every foot, given by a cell in it, and those across the creases in u and in v.
+
+    Bit 0 of `tries` says that the foot now looks across the crease in u, bit 1 across that in v.
+    """
+
+    base: Int[Array, "2 points"]
+    across: Int[Array, "2 points"]
+    tries: Int[Array, "1 points"]
+    before: Float[Array, "1 points"]  # squared distance when the tries began
+
+    @property
+    def cell(self) -> Int[Array, "2 points"]:
+        """The cell that stands for the region that the foot is in now."""
+        return jnp.where((self.tries & jnp.asarray([[1], [2]], jnp.int32)) > 0, self.across, self.base)
+
+
+def initial_region(pieces: Pieces, feet: Feet) -> SmoothRegion:
+    """Every foot in the region it starts from."""
+    u, v = feet.trial
+    cell = jnp.stack([pieces.axis_u.locate(u), pieces.axis_v.locate(v)])
+    return SmoothRegion(cell, cell, jnp.zeros_like(cell[:1]), jnp.full_like(feet.real[4:], jnp.inf))
+
+
+def cells_of_regions(pieces: Pieces, region: SmoothRegion, cell_u: Array, cell_v: Array) -> list[Array]:
+    """The cells of the trials, within the regions they are confined to."""
+    axes = (pieces.axis_u, pieces.axis_v)
+    parts = zip((cell_u, cell_v), axes, region.cell, strict=True)
+    return [jnp.clip(cell, take(a.first, mine, 0), take(a.last, mine, 0)) for cell, a, mine in parts]
+
+
+def cross_creases(
+    pieces: Pieces, old: Feet, new: Feet, region: SmoothRegion, limits: Limits
+) -> tuple[Feet, SmoothRegion]:
+    """Send feet that have just been found on a crease to look across it; the rest stay as they are."""
+    found, best = ((new.state == FOUND) & (old.state == GOING))[None], new.real[4:]
+    begins = (region.tries == 0) | (best < region.before - limits.slack(best))
+    cell, axes = region.cell, (pieces.axis_u, pieces.axis_v)
+    sides = [_across(a, x, mine) for a, x, mine in zip(axes, new.real[2:4], cell, strict=True)]
+    base, across = jnp.where(begins, cell, region.base), jnp.where(begins, jnp.stack(sides), region.across)
+    tries, before = jnp.where(begins, 1, region.tries + 1), jnp.where(begins, best, region.before)
+    goes_on = found & (across != base).any(0)[None] & (tries <= LAST_TRY)
+    pairs = (base, region.base), (across, region.across), (tries, region.tries), (before, region.before)
+    after = SmoothRegion(*(jnp.where(goes_on, after, before) for after, before in pairs))
+    return new.with_state(jnp.where(goes_on[0], GOING, new.state)), after
+
+
+def _across(axis: Axis, u: Array, cell: Array) -> Array:
+    """The cell just across the crease that u lies on, or `cell` if it lies on none."""
+    at_low = (u <= take(axis.low, cell, 0)) & (u > axis.breaks[0])
+    at_high = (u >= take(axis.high, cell, 0)) & (u < axis.breaks[-1])
+    return jnp.where(at_low, take(axis.before, cell, 0), jnp.where(at_high, take(axis.after, cell, 0), cell))

@@ -1,0 +1,36 @@
+"""Ctrl-C while the command `jaxfit` is still being imported ends it without a traceback."""
+
+import os
+import signal
+import sys
+import threading
+from itertools import pairwise
+from typing import Any
+
+EXIT_CODE = 130
+
+
+def end_at_once(*_: Any) -> None:
+    """A handler of signals: there is nothing yet to be put in order."""
+    os._exit(EXIT_CODE)
+
+
+def is_the_command() -> bool:
+    """Whether this process is `jaxfit` or `python -m jaxfit`, and not a program that uses the package."""
+    name = os.path.basename(getattr(sys, "argv", [""])[0])
+    as_module = name == "-m" and ("-m", "jaxfit") in pairwise(sys.orig_argv)
+    return as_module or os.path.splitext(name)[0] in ("jaxfit", "jaxfit-script")
+
+
+def raise_again() -> None:
+    """Have Ctrl-C raise KeyboardInterrupt as usual, once there is someone to catch it."""
+    if signal.getsignal(signal.SIGINT) is end_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+if (
+    is_the_command()
+    and threading.current_thread() is threading.main_thread()
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):
+    signal.signal(signal.SIGINT, end_at_once)

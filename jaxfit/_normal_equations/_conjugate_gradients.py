@@ -1,0 +1,64 @@
+"""Preconditioned conjugate gradients on nets: the one iteration of all solvers that are not direct."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+Operator = Callable[[Array], Array]
+
+
+class Solution(NamedTuple):
+    """An approximate solution, the residual that it leaves, and whether the tolerance is met."""
+
+    net: Float[Array, "nu nv c"]
+    residual: Float[Array, "nu nv c"]
+    met: Bool[Array, ""]
+    steps: Int[Array, ""]
+
+
+def conjugate_gradients(
+    matrix: Operator,
+    right: Float[Array, "nu nv c"],
+    preconditioner: Operator,
+    rtol: float,
+    max_steps: int,
+    coupled: bool,
+) -> Solution:
+    """Solves a positive semidefinite system from 0.
+
+    Stops where the residual, in the norm of the preconditioner, is `rtol` times the right-hand side, after
+    `max_steps` iterations, or where the matrix has no curvature. Stopped anywhere the solution is a direction
+    of descent: the quadratic model falls from one iteration to the next. Unless the channels are `coupled`
+    each has a step length of its own.
+    """
+
+    def inner(x: Array, y: Array) -> Array:
+        return jnp.sum(x * y, axis=None if coupled else (0, 1), keepdims=True)
+
+    def unfinished(carry: tuple[Array, ...]) -> Array:
+        _, _, _, slope, steps = carry
+        return jnp.any(slope > goal) & (steps < max_steps)
+
+    def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+        net, left, along, slope, steps = carry
+        image = matrix(along)
+        length = _ratio(slope, inner(along, image))
+        net, left = net + length * along, left - length * image
+        nearby = preconditioner(left)
+        after = jnp.where(length > 0, inner(left, nearby), 0.0)
+        return net, left, nearby + _ratio(after, slope) * along, after, steps + 1
+
+    first = preconditioner(right)
+    slope = inner(right, first)
+    goal = rtol**2 * slope
+    begin = (jnp.zeros_like(right), right, first, slope, jnp.asarray(0, jnp.int32))
+    net, left, _, slope, steps = lax.while_loop(unfinished, step, begin)
+    return Solution(net, left, jnp.all(slope <= goal) & jnp.all(jnp.isfinite(left)), steps)
+
+
+def _ratio(x: Array, y: Array) -> Array:
+    """x / y; 0 where y is not positive, as for a channel that is solved exactly."""
+    return jnp.where(y > 0, x / jnp.where(y > 0, y, 1.0), 0.0)

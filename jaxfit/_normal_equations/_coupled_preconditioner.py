@@ -1,0 +1,66 @@
+"""A preconditioner for coupled normal matrices: an uncoupled factor in rotated frames."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxfit._normal_equations._block_cholesky import Factors, factorise, substitute
+from jaxfit._normal_equations._conjugate_gradients import Solution, conjugate_gradients
+from jaxfit._normal_equations._coupled_stencil import CoupledStencil
+from jaxfit._normal_equations._stencil import Stencil
+
+LEAST_SHARE = 1e-12  # of a coordinate direction in what a control point weighs
+
+
+class CoupledPreconditioner(eqx.Module):
+    r"""$S^{-1/2} (M_0^{-1} \otimes I)\, S^{-1/2}$ with an uncoupled matrix M_0 and a block S_ij for each
+    control point.
+
+    S_ij is the block of control point (i, j) with itself, divided by what M_0 has there: about
+    $\Pi + \mu (I - \Pi)$ for the normal around (i, j). Where normals vary slowly over the support of a basis
+    function, $S^{1/2} (M_0 \otimes I) S^{1/2}$ is nearly the matrix.
+    """
+
+    factors: Factors
+    roots: Float[Array, "nu nv d d"]  # S^(-1/2)
+
+    def __call__(self, right: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
+        """Near the solution."""
+        return self._rotated(substitute(self.factors, self._rotated(right)))
+
+    def _rotated(self, x: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
+        return jnp.sum(self.roots * x[:, :, None, :], axis=-1)
+
+
+def coupled_preconditioner(
+    matrix: CoupledStencil, uncoupled: Stencil, free: Bool[Array, "nu nv"]
+) -> CoupledPreconditioner:
+    """For the matrix on the free control points, those where `uncoupled` has a positive diagonal."""
+    diagonal = jnp.where(free, uncoupled.diagonal, 1.0)[:, :, None, None]
+    blocks = matrix.blocks / diagonal
+    unit = jnp.eye(blocks.shape[-1], dtype=diagonal.dtype)
+    values, vectors = jnp.linalg.eigh(
+        jnp.where(free[:, :, None, None], blocks, unit[None, None]), symmetrize_input=False
+    )
+    scaled = vectors * lax.rsqrt(jnp.maximum(values, LEAST_SHARE))[:, :, None, :]
+    roots = jnp.einsum("ijab,ijcb->ijac", scaled, vectors, precision="highest")
+    return CoupledPreconditioner(factorise(uncoupled, free), roots)
+
+
+def solve_coupled(
+    matrix: CoupledStencil,
+    right: Float[Array, "nu nv d"],
+    free: Bool[Array, "nu nv"],
+    preconditioner: CoupledPreconditioner,
+    rtol: float,
+    max_steps: int,
+) -> Solution:
+    """The solution on the free control points, 0 elsewhere, by conjugate gradients."""
+    inside = free[:, :, None]
+
+    def masked(x: Array) -> Array:
+        return jnp.where(inside, matrix(x), 0.0)
+
+    right = jnp.where(inside, right, 0.0)
+    return conjugate_gradients(masked, right, preconditioner, rtol, max_steps, coupled=True)
