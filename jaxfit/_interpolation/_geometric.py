@@ -92,7 +92,10 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         than at the averages. What they converge to is the same unless the surface folds.
     symmetry : Reflection(), optional
         Reflectional symmetry of the surface (section 3.2). Data, parameters and knots are made symmetric
-        once, which the iteration keeps: the fit meets the symmetrised data, with a symmetric net.
+        once, which the iteration keeps: the net is symmetric, and errors are measured to the symmetrised
+        data. How far the given points were from symmetric is `Fit.stats["asymmetry"]`: the largest distance
+        between a point and the mirror image of its partner, as a fraction of the diagonal. No point is moved
+        by more than half of that.
     adjoint : UnrolledAdjoint() or ImplicitAdjoint()
         What derivatives in the data mean: those of the fit as run, or those at held parameters.
     stall_window, stall_gain : int, float
