@@ -253,11 +253,42 @@ def test_throw_raises_the_reason():
         (GRID[:3], "grid must have at least 4 x 4 points"),
         (GRID[..., 0], "grid must have 3 dimensions"),
         (np.ones((5, 5, 3)), "must not all coincide"),
+        (np.ma.masked_less(GRID, 0.1), "grid must not be masked.*leave out those points, or fill them"),
+        (GRID + 1e16, "subtract their centre"),
     ],
 )
 def test_bad_grids_get_a_sentence(grid, sentence):
     with pytest.raises(ValueError, match=sentence):
         jf.interpolate(grid)
+
+
+@pytest.mark.parametrize("tolerance", [np.inf, np.nan, -1.0])
+def test_tolerances_that_are_none_get_a_sentence(tolerance):
+    for method in (jf.GeometricInterpolation, jf.StandardInterpolation):
+        with pytest.raises(ValueError, match="tolerance must be"):
+            jf.interpolate(GRID, method(), tolerance=tolerance)
+        with pytest.raises(ValueError, match="foot_tolerance must be"):
+            method(foot_tolerance=tolerance)
+
+
+def test_errors_of_a_symmetric_fit_say_how_far_the_data_were_from_symmetric():
+    noisy = GRID + np.random.default_rng(0).normal(scale=2e-3, size=GRID.shape)
+    reflection = jf.Reflection(normal=np.eye(3)[0])
+    fit = jf.interpolate(noisy, jf.GeometricInterpolation(symmetry=reflection))
+    expected = float(reflection.located(noisy).asymmetry(noisy)) / diagonal(noisy)
+    np.testing.assert_allclose(fit.stats["asymmetry"], expected, rtol=1e-12)
+    moved = np.linalg.norm(np.asarray(fit.surface(fit.u, fit.v)) - noisy, axis=-1).max() / diagonal(noisy)
+    np.testing.assert_allclose(moved, expected / 2, rtol=1e-6)
+    assert "measured to the symmetrised grid" in fit.message
+    assert f"{moved:.2g}" in fit.message
+    assert "symmetrised" not in jf.interpolate(noisy, max_steps=1).message
+
+
+@pytest.mark.parametrize("method", [jf.GeometricInterpolation(), jf.StandardInterpolation(per_point=True)])
+def test_any_number_of_steps_costs_no_memory(method):
+    fit = jf.interpolate(GRID, method, max_steps=10**9)
+    assert bool(fit.converged), fit.message
+    assert len(fit.history.maximum) == int(fit.stats["num_steps"]) + 1
 
 
 def test_a_hood_is_met_to_rounding():

@@ -100,10 +100,23 @@ def _as_feet_jvp(primals: Any, tangents: Any) -> Any:
     if within is None:
         order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
         within = _ends(knots_u, order_u) + _ends(knots_v, order_v)
+    change = foot_change((u, v), (gu, gv), (E, F, G), (a, b, c), (dgu, dgv), within, tolerance)
+    return (u, v), change
+
+
+def foot_change(
+    feet: Any, slopes: Any, form: Any, hessian: Any, changes: Any, within: Border, tolerance: Array
+) -> tuple[Array, Array]:
+    """How feet follow a change of their `slopes` (g_u, g_v) at held parameters.
+
+    `form` are E, F, G and `hessian` its three entries; coordinates that are not free do not move.
+    """
+    (u, v), (gu, gv), (E, _, G) = feet, slopes, form
     low_u, high_u, low_v, high_v = within
     free_u = _free(u, gu, E, low_u, high_u, tolerance)
     free_v = _free(v, gv, G, low_v, high_v, tolerance)
-    return (u, v), _solve(a, b, c, E, G, dgu, dgv, free_u, free_v)
+    (a, b, c), (x, y) = hessian, changes
+    return _solve(a, b, c, E, G, x, y, free_u, free_v)
 
 
 def _ends(knots: Array, order: int) -> tuple[Array, Array]:

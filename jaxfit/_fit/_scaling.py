@@ -73,13 +73,14 @@ class Outward(eqx.Module):
     high: Float[Any, " d"]
     low: Float[Any, " d"]
 
-    def __call__(self, x: Float[Array, "n m d"]) -> Float[Array, "n m d"]:
+    def __call__(self, x: Float[Any, "n m d"]) -> Float[Any, "n m d"]:
         """Out of the problem's unit."""
         return (x * self.factors[0] * self.factors[1] + self.low[None, None]) + self.high[None, None]
 
-    def loss(self, net: Float[Array, "n m d"], diagonal: Array) -> Float[Array, ""]:
+    def loss(self, net: Float[Any, "n m d"], diagonal: Any) -> Float[Any, ""]:
         """`Unit.loss` of a net in the user's unit, the diagonal being in the problem's."""
-        reach = jnp.max(jnp.abs(net)) / self.factors[0] / self.factors[1]
+        xp: Any = np if is_concrete(net) else jnp
+        reach = xp.max(xp.abs(net)) / self.factors[0] / self.factors[1]
         return rounding_loss(net, reach / diagonal)
 
 

@@ -1,5 +1,7 @@
 """Surfaces through all points of a grid."""
 
+from jaxfit._interpolation._adjoints import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._interpolation._adjoints import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import Chebyshev as Chebyshev
 from jaxfit._interpolation._fixed_parameters import Richardson as Richardson
 from jaxfit._interpolation._geometric import GeometricInterpolation as GeometricInterpolation
@@ -9,5 +11,3 @@ from jaxfit._interpolation._repositioning import ConstantWeight as ConstantWeigh
 from jaxfit._interpolation._repositioning import OptimalRepositioning as OptimalRepositioning
 from jaxfit._interpolation._repositioning import UnitWeights as UnitWeights
 from jaxfit._interpolation._standard import StandardInterpolation as StandardInterpolation
-from jaxfit._interpolation._transposed_solve import ImplicitAdjoint as ImplicitAdjoint
-from jaxfit._interpolation._transposed_solve import UnrolledAdjoint as UnrolledAdjoint

@@ -1,7 +1,6 @@
 """Geometric interpolation with the feet held: a linear fixed-point iteration on the net (section 3.3.1)."""
 
 from abc import abstractmethod
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._loop import MAX_GROWTH
 from jaxfit._fit._problem import Tolerances
-from jaxfit._interpolation._tensor_collocation import Windows, applied, gathered, stencil_of
+from jaxfit._interpolation._point_collocation import PointCollocation
 
 
 class AbstractAcceleration(eqx.Module):
@@ -81,7 +80,7 @@ class Chebyshev(AbstractAcceleration):
 class System(eqx.Module):
     """What stays the same while the feet are held."""
 
-    windows: Windows
+    collocation: PointCollocation
     target: Float[Array, "d nu nv"]
     weight: Float[Array, "nu nv"]
     held: Bool[Any, "nu nv"]  # control points that do not move and count for no error
@@ -103,17 +102,14 @@ def iterate_frozen(
     Records the errors at the held feet, but those of step `first`, which is known exactly. Unless `most`
     ended it, the net it ends with has been recorded.
     """
-    stencil, windows = stencil_of(system.windows), system.windows
-    close = windows.is_close()
+    is_close, times_close = system.collocation.is_close(), system.collocation.times_close()
     last = first + most
     exact = history.at(first)
     acceleration: AbstractAcceleration = method.acceleration
 
     def body(x: tuple[Array, Array, Array, ErrorHistory, Any]) -> Any:
         _, net, step, history, state = x
-        e = system.target - lax.cond(
-            close, partial(applied, windows, stencil), partial(gathered, windows), net
-        )
+        e = system.target - lax.cond(is_close, times_close, lambda net: system.collocation.times(net), net)
         square: Any = sum(e[1:] ** 2, e[0] ** 2)
         error = jnp.where(system.held, 0.0, jnp.sqrt(square)) / system.diagonal
         average, maximum = jnp.mean(error), jnp.max(error)

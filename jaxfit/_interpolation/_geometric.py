@@ -17,27 +17,38 @@ from jaxfit._fit._measure import measure_grid, side_bounds
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
+from jaxfit._interpolation._geometric_fit import geometric_fit
+from jaxfit._interpolation._method import (
+    AbstractInterpolation,
+    GridProblem,
+    Progress,
+    finish,
+    refuse_normals,
+)
+from jaxfit._interpolation._point_collocation import point_collocation
 from jaxfit._interpolation._repositioning import AbstractRepositioning, OptimalRepositioning
-from jaxfit._interpolation._tensor_collocation import windows_at
-from jaxfit._interpolation._transposed_solve import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
 
 
 class GeometricState(eqx.Module):
-    """The surface with the smallest maximum error so far, and the smallest eigenvalue of the collocation
-    matrix, where a choice of the method asks for it.
+    """The surface with the smallest maximum error so far; feet before the first moves, which derivatives
+    replay (NaN where there are none); and the smallest eigenvalue of the collocation matrix, where a choice
+    of the method asks for it.
     """
 
     best: WorkingSurface
     projection: Projection
     maximum: Float[Any, ""]
+    path: Float[Any, "moves 2 points"]
     lowest: Float[Any, ""]
 
 
-class GeometricInterpolation(AbstractIterativeMethod):
+class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     r"""Move every control point by the error vector of its own data point, until all vanish.
 
     The control net starts as the data (12). In every iteration the closest point of each $Q_{ij}$ on the
@@ -81,7 +92,10 @@ class GeometricInterpolation(AbstractIterativeMethod):
         than at the averages. What they converge to is the same unless the surface folds.
     symmetry : Reflection(), optional
         Reflectional symmetry of the surface (section 3.2). Data, parameters and knots are made symmetric
-        once, which the iteration keeps: the fit meets the symmetrised data, with a symmetric net.
+        once, which the iteration keeps: the net is symmetric, and errors are measured to the symmetrised
+        data. How far the given points were from symmetric is `Fit.stats["asymmetry"]`: the largest distance
+        between a point and the mirror image of its partner, as a fraction of the diagonal. No point is moved
+        by more than half of that.
     adjoint : UnrolledAdjoint() or ImplicitAdjoint()
         What derivatives in the data mean: those of the fit as run, or those at held parameters.
     stall_window, stall_gain : int, float
@@ -124,6 +138,14 @@ class GeometricInterpolation(AbstractIterativeMethod):
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
+    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+        """None can be met."""
+        refuse_normals(self, normals)
+
+    def fit(self, problem: GridProblem, progress: Progress | None) -> Fit:
+        """Parameters and knots, and the loop."""
+        return finish(*geometric_fit(self, problem, progress))
+
     @property
     def needs_spectrum(self) -> bool:
         """Whether the smallest eigenvalue of the collocation matrix plays a part."""
@@ -145,7 +167,9 @@ class GeometricInterpolation(AbstractIterativeMethod):
         """Nothing is known yet; whoever needs the eigenvalue sets it."""
         xp: Any = np if is_concrete(problem) else jnp
         far = xp.asarray(np.inf, problem.target.dtype)
-        return surface, GeometricState(surface, projection, far, xp.ones_like(far))
+        moves = self.adjoint.moves(self.freeze_after)
+        path = np.full((0 if moves is None else moves + 1, 2, problem.target.shape[1]), np.nan, far.dtype)
+        return surface, GeometricState(surface, projection, far, path, xp.ones_like(far))
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
         """Closest points from the last ones."""
@@ -162,10 +186,13 @@ class GeometricInterpolation(AbstractIterativeMethod):
             held,
             within,
         )
-        best: GeometricState = iterate.state
-        maximum = jnp.max(here.error)
-        new = GeometricState(surface, here, maximum, best.lowest)
-        return here, jax.tree.map(lambda x, y: lax.select(maximum < best.maximum, x, y), new, best)
+        state: GeometricState = iterate.state
+        maximum, path = jnp.max(here.error), state.path
+        if path.shape[0]:
+            path = path.at[iterate.step].set(jnp.stack([here.u, here.v]), mode="drop")
+        parts = ((surface, here, maximum), (state.best, state.projection, state.maximum))
+        *best, least = jax.tree.map(lambda x, y: lax.select(maximum < state.maximum, x, y), *parts)
+        return here, GeometricState(best[0], best[1], least, path, state.lowest)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new one: errors may rise on the way."""
@@ -176,10 +203,10 @@ class GeometricInterpolation(AbstractIterativeMethod):
         surface, here = iterate.surface, iterate.projection
         nu, nv = surface.control_points.shape[:2]
         target = problem.target.reshape(-1, nu, nv)
-        windows = windows_at(surface.axes, here.u.reshape(nu, nv), here.v.reshape(nu, nv))
+        collocation = point_collocation(surface.axes, here.u.reshape(nu, nv), here.v.reshape(nu, nv))
         lowest = iterate.state.lowest
-        weight = self.repositioning.weights(windows, lowest)
-        system = System(windows, target, weight, corners(nu, nv), lowest, problem.diagonal)
+        weight = self.repositioning.weights(collocation, lowest)
+        system = System(collocation, target, weight, corners(nu, nv), lowest, problem.diagonal)
         if self.freeze_after is None:
             most = jnp.ones_like(iterate.step)
         else:

@@ -1,7 +1,6 @@
-"""From a grid to a Fit by geometric interpolation: units, symmetry, and the loop."""
+"""Geometric interpolation from a grid to a solution: symmetry, parameters, knots, the loop, derivatives."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,22 +11,24 @@ import numpy as np
 from jax import Array, lax
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._border import corners
-from jaxfit._fit._history import public_history, without_counts
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._problem import Problem, Tolerances
-from jaxfit._fit._reasons import RESULTS, code_of, result_of
-from jaxfit._fit._result import Fit
-from jaxfit._fit._scaling import Unit, unit_of
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._interpolation._geometric import GeometricInterpolation
-from jaxfit._interpolation._geometric_derivative import Found, Setting, followed
-from jaxfit._interpolation._outcome import extent_of, is_flat
+from jaxfit._interpolation._adjoints import ImplicitAdjoint
+from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
+from jaxfit._interpolation._method import (
+    CORNERS,
+    Frame,
+    GridProblem,
+    Progress,
+    Solution,
+    errors_only,
+    extent_of,
+    is_flat,
+)
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
-from jaxfit._interpolation._transposed_solve import UnrolledAdjoint
-from jaxfit._parameters import grid_parameters
-from jaxfit._precision import interpolation_tolerance, working_dtype
-from jaxfit._splines import BSplineSurface, Reflection, averaging_knots
+from jaxfit._parameters import AbstractParametrisation, grid_parameters
+from jaxfit._splines import Reflection, averaging_knots
 
 Pair = tuple[Any, Any]
 
@@ -41,11 +42,17 @@ class Start(eqx.Module):
     extent: Array
 
 
-@partial(jax.jit, static_argnames=("method", "order", "axis"))
-def started(method: GeometricInterpolation, order: tuple[int, int], axis: int | None, data: Array) -> Start:
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def started(
+    parametrisation: AbstractParametrisation,
+    per_point: bool,
+    order: tuple[int, int],
+    axis: int | None,
+    data: Array,
+) -> Start:
     """Parameters and knots; symmetric along `axis` if that is given."""
     n, m, _ = data.shape
-    parameters = grid_parameters(data, method.parametrisation)
+    parameters = grid_parameters(data, parametrisation)
     u, v = parameters.u, parameters.v
     rows = (parameters.rows_u, parameters.rows_v)
     if axis is not None:
@@ -54,60 +61,66 @@ def started(method: GeometricInterpolation, order: tuple[int, int], axis: int | 
     knots = [averaging_knots(t, k) for t, k in zip((u, v), order, strict=True)]
     if axis is not None:
         knots[axis] = Reflection(axis).symmetrise_knots(knots[axis])
-    if not method.per_point:
+    if not per_point:
         rows = (jnp.broadcast_to(u[:, None], (n, m)), jnp.broadcast_to(v[None, :], (n, m)))
     return Start(rows, (u, v), (knots[0], knots[1]), extent_of(data))
 
 
-def geometric_fit(
-    method: GeometricInterpolation,
-    grid: Any,
-    order: tuple[int, int],
-    tolerance: Any,
-    max_steps: int,
-    progress: Callable[[int, int, float, float], None] | None,
-) -> Fit:
-    """The whole fit of a checked grid.
+def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) -> tuple[Solution, Frame]:
+    """The solution, and the frame with the corners of what has been fitted.
 
     Raises ValueError where concrete data has no extent along one index, or no plane of symmetry.
     """
-    unit = unit_of(grid.reshape(-1, grid.shape[2]), "points of grid")
-    concrete = is_concrete(grid, tolerance)
-    dtype = working_dtype()
-    inner, symmetry = unit.inward(grid), method.symmetry
+    data, frame, symmetry, stats = problem.data, problem.frame, method.symmetry, {}
+    concrete = is_concrete(data, frame)
     if symmetry is not None:
-        symmetry = symmetry.in_unit(unit.centre, unit.scale).located(inner)
-        inner = symmetry.symmetrise_points(inner)
-        grid = unit.outward(np.asarray(inner) if concrete else inner)
-    # Of the method only what the loop needs, so that other choices compile nothing.
-    adjoint, method = method.adjoint, dataclasses.replace(method, symmetry=None, adjoint=UnrolledAdjoint())
-    inner = (np.asarray(inner) if concrete else inner).astype(dtype)
-    order = (int(order[0]), int(order[1]))
-    start = started(method, order, None if symmetry is None else symmetry.axis, inner)
+        symmetry = symmetry.in_unit(problem.unit.centre, problem.unit.scale).located(data)
+        stats["asymmetry"] = lax.stop_gradient(symmetry.asymmetry(data)) / frame.diagonal
+        data = symmetry.symmetrise_points(data)
+        data = np.asarray(data) if concrete else data
+        frame = dataclasses.replace(frame, corners=frame.outward(data[CORNERS]))
+    axis = None if symmetry is None else symmetry.axis
+    start = started(method.parametrisation, method.per_point, problem.order, axis, data)
     if concrete:
         start = jax.tree.map(np.asarray, start)
-        _check(method, inner, start, symmetry)
-    goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
-    setting = _setting(method, inner, start, unit, goal)
-    fixed = lax.stop_gradient(setting) if not concrete else setting
-    loop, problem = _iterated(method, order, fixed, max_steps, progress)
-    end = loop.current
+        _check(method, data, start, symmetry)
+    xp: Any = np if concrete else jnp
+    foot_tolerance = xp.asarray(method.foot_tolerance, data.dtype)
+    inputs = FitInputs(
+        data, start.knots, start.averaged, start.feet, frame.diagonal, frame.goal, foot_tolerance
+    )
+    loop = _iterated(method, lax.stop_gradient(inputs) if not concrete else inputs, frame.max_steps, progress)
+    end, shape = loop.current, data.shape[:2]
     net, here = end.surface.control_points, end.projection
-    n, m, _ = grid.shape
     if symmetry is not None:
         net = symmetry.symmetrise_points(net)
         net = net if concrete else lax.stop_gradient(net)
-    u, v = here.u, here.v
+    u, v = here.u.reshape(shape), here.v.reshape(shape)
     if not concrete:
-        found = Found(net, u.reshape(n, m), v.reshape(n, m))
-        found = followed(dataclasses.replace(method, adjoint=adjoint), order, found, setting)
-        net, u, v = found.net, found.u.reshape(-1), found.v.reshape(-1)
-    end = eqx.tree_at(lambda x: (x.surface.control_points, x.projection.u, x.projection.v), end, (net, u, v))
-    loop = eqx.tree_at(lambda x: x.current, loop, end)
-    return _fit(loop, problem, unit, grid, start.knots, tolerance)
+        # Of the method only what plays a part, so that other choices compile nothing.
+        how = dataclasses.replace(method, symmetry=None)
+        fitted = attach_derivative(how, problem.order, Fitted(net, u, v), end.state.path, inputs)
+        net, u, v = fitted.net, fitted.u, fitted.v
+    error, lost = (
+        here.error,
+        jnp.sum(~here.converged) if not concrete else np.sum(~np.asarray(here.converged)),
+    )
+    solution = Solution(
+        net=np.asarray(net) if concrete else net,
+        knots=start.knots,
+        u=u,
+        v=v,
+        errors=(np.asarray(error) if concrete else error).reshape(shape) / frame.diagonal,
+        history=errors_only(loop.history, end.step),
+        code=loop.code,
+        steps=end.step,
+        unconverged_feet=lost,
+        stats={"diagonal": problem.unit.diagonal, **stats},
+    )
+    return solution, frame
 
 
-def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: Reflection | None) -> None:
+def _check(method: Any, inner: Any, start: Start, symmetry: Reflection | None) -> None:
     """Raise where a grid has no parameters, so that the traced part made some up."""
     flat = is_flat(start.extent, inner)
     increasing = all((np.diff(x) > 0).all() for x in start.averaged)
@@ -120,67 +133,22 @@ def _check(method: GeometricInterpolation, inner: Any, start: Start, symmetry: R
         grid_parameters(inner, method.parametrisation)
 
 
-def _setting(method: GeometricInterpolation, inner: Any, start: Start, unit: Unit, tolerance: Any) -> Setting:
-    xp: Any = np if is_concrete(inner, tolerance) else jnp
-    number = partial(xp.asarray, dtype=inner.dtype)
-    diagonal = number(unit.diagonal / unit.scale)
-    feet = number(method.foot_tolerance)
-    return Setting(inner, start.knots, start.averaged, start.feet, diagonal, number(tolerance), feet)
-
-
-def _iterated(
-    method: GeometricInterpolation,
-    order: tuple[int, int],
-    setting: Setting,
-    max_steps: int,
-    progress: Any,
-) -> tuple[LoopState, Problem]:
-    xp: Any = np if is_concrete(setting) else jnp
-    target = setting.data.reshape(-1, setting.data.shape[2]).T
+def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress | None) -> LoopState:
+    concrete = is_concrete(inputs)
+    xp: Any = np if concrete else jnp
+    # Without derivatives no feet need to be remembered.
+    adjoint = ImplicitAdjoint() if concrete else method.adjoint
+    method = dataclasses.replace(method, symmetry=None, adjoint=adjoint)
+    target = inputs.data.reshape(-1, inputs.data.shape[2]).T
     # The net fixes the size, so points are not padded.
     ones, real = np.ones(target.shape[1], target.dtype), np.ones(target.shape[1], bool)
-    far = xp.full_like(setting.tolerance, np.inf)
-    limits = Tolerances(far, setting.tolerance, xp.asarray(max_steps, np.int32))
-    problem = Problem(target, ones, real, setting.diagonal, xp.ones_like(far), limits)
-    surface = WorkingSurface.of(setting.data, *setting.knots, simple=True)
-    u, v = (x.reshape(-1) for x in setting.feet)
-    loop = begin(method, problem, surface, u, v, max_steps)
+    far = xp.full_like(inputs.tolerance, np.inf)
+    limits = Tolerances(far, inputs.tolerance, max_steps)
+    problem = Problem(target, ones, real, inputs.diagonal, xp.ones_like(far), limits)
+    surface = WorkingSurface.of(inputs.data, *inputs.knots, simple=True)
+    u, v = (x.reshape(-1) for x in inputs.feet)
+    loop = begin(method, problem, surface, u, v, int(max_steps))
     if method.needs_spectrum:
-        lowest = lowest_eigenvalue(surface.axes, setting.averaged)
+        lowest = lowest_eigenvalue(surface.axes, inputs.averaged)
         loop = eqx.tree_at(lambda x: (x.current.state.lowest, x.next.state.lowest), loop, (lowest, lowest))
-    loop, _ = run(method, problem, loop, progress if is_concrete(setting) else None)
-    return loop, problem
-
-
-def _fit(loop: LoopState, problem: Problem, unit: Unit, grid: Any, knots: Pair, tolerance: Any) -> Fit:
-    n, m, _ = grid.shape
-    concrete = is_concrete(loop, grid)
-    xp: Any = np if concrete else jnp
-    here, net = loop.current.projection, xp.asarray(loop.current.surface.control_points)
-    here = jax.tree.map(np.asarray, here) if concrete else here
-    # Corners are never moved: they are the data, to the last bit.
-    points = xp.where(corners(n, m)[..., None], grid, unit.outward(net)).astype(net.dtype)
-    errors = here.error / problem.diagonal + lax.stop_gradient(unit.loss(points))
-    missed = (loop.code == code_of(RESULTS.converged)) & (xp.max(errors) > tolerance)
-    code = xp.where(missed, np.int32(code_of(RESULTS.rounded)), loop.code)
-    lost = xp.sum(~here.converged)
-    parts = [here.u.reshape(n, m), here.v.reshape(n, m), errors.reshape(n, m)]
-    parts = [*parts, xp.mean(errors), xp.max(errors)]
-    if concrete:
-        parts = jax.device_put([np.asarray(x, net.dtype) for x in parts])
-    return Fit(
-        surface=BSplineSurface(points, *knots),
-        u=parts[0],
-        v=parts[1],
-        errors=parts[2],
-        average_error=parts[3],
-        maximum_error=parts[4],
-        history=without_counts(public_history(loop.history, loop.current.step)),
-        result=result_of(code),
-        stats={
-            "num_steps": loop.current.step,
-            "diagonal": unit.diagonal,
-            "unconverged_feet": lost,
-            "tolerance": tolerance,
-        },
-    )
+    return run(method, problem, loop, progress if concrete else None)[0]

@@ -1,23 +1,30 @@
 """Interpolation of grids whose points have unit normals: tensor-product Hermite interpolation."""
 
-from functools import partial
+from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._checks import check_kind, check_number
-from jaxfit._interpolation._outcome import extent_of
+from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._reasons import RESULTS, code_of
+from jaxfit._interpolation._gmres import distances
+from jaxfit._interpolation._method import AbstractDirectInterpolation, GridProblem, Solution, single_entry
+from jaxfit._interpolation._tensor_collocation import tensor_collocation
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import _banded as banded
 from jaxfit._splines import averaging_knots
 
 Pair = tuple[Array, Array]
 
+LEAST_ORDER = 3
+UNIT_TO = 1e-3  # how far from 1 the length of a normal may be
+DEFAULT_ANGLE = {"float64": 1e-9, "float32": 1e-3}
 
-class NormalInterpolation(eqx.Module):
+
+class NormalInterpolation(AbstractDirectInterpolation):
     r"""Pass through every point of a grid with the tangent plane that its normal asks for.
 
     A tensor-product spline with twice as many control points as data points in each direction is fixed by
@@ -66,42 +73,70 @@ class NormalInterpolation(eqx.Module):
         if self.normal_tolerance is not None:
             check_number("normal_tolerance", self.normal_tolerance, 0.0)
 
+    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+        """Unit vectors, one for each point of the grid."""
+        return _checked_normals(normals, grid, order)
 
-class NormalSolution(eqx.Module):
-    """What the traced part returns; lengths in the problem's unit."""
+    def solve(self, problem: GridProblem, history: ErrorHistory) -> Solution:
+        """Values, tangents and twists, and two passes of elimination."""
+        data, order, frame = problem.data, problem.order, problem.frame
+        normals: Any = problem.normals
+        lengths = jnp.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = normals / jnp.where(lengths > 0, lengths, 1.0)
+        parameters = grid_parameters(data, self.parametrisation)
+        u, v = parameters.u, parameters.v
+        tangent_u = _flattened(slopes(u, order[0], data, 0), normals)
+        tangent_v = _flattened(slopes(v, order[1], data, 1), normals)
+        twist = 0.5 * (slopes(v, order[1], tangent_u, 1) + slopes(u, order[0], tangent_v, 0))
+        given = interleaved(interleaved(data, tangent_u, 0), interleaved(tangent_v, twist, 0), 1)
+        twice = (averaging_knots(jnp.repeat(t, 2), k) for t, k in zip((u, v), order, strict=True))
+        knots = next(twice), next(twice)
+        tensor = tensor_collocation(knots, order, u, v, (0, 1))
+        net = tensor.solve(given)
+        # What the surface takes there, as it stands: values, derivatives along u and along v.
+        on_rows, across_rows = parted(lax.stop_gradient(tensor.times(net)), 1)
+        (values, derivative_u), (derivative_v, _) = parted(on_rows, 0), parted(across_rows, 0)
+        errors = distances(lax.stop_gradient(data) - values, frame.diagonal)
+        angles = angles_between(jnp.cross(derivative_u, derivative_v), lax.stop_gradient(normals))
+        worst = jnp.max(angles)
+        met, missed = np.int32(code_of(RESULTS.converged)), np.int32(code_of(RESULTS.normals_missed))
+        code = jnp.where(worst > self._largest_angle(data.dtype), missed, met)
+        code = jnp.where(jnp.max(errors) <= frame.goal, code, np.int32(code_of(RESULTS.stalled)))
+        u, v = (jnp.broadcast_to(x, data.shape[:2]) for x in (u[:, None], v[None, :]))
+        zero, stats = np.int32(0), {"normal_errors": angles, "maximum_normal_error": worst}
+        return Solution(net, knots, u, v, errors, single_entry(errors), code, zero, zero, stats)
 
-    net: Float[Array, "nu nv d"]
-    knots: Pair
-    parameters: Pair
-    residual: Float[Array, "n m"]  # distances of the data from the surface at the parameters
-    angles: Float[Array, "n m"]
-    extent: Float[Array, "2"]
+    def _largest_angle(self, dtype: Any) -> float:
+        if self.normal_tolerance is not None:
+            return self.normal_tolerance
+        return DEFAULT_ANGLE.get(np.dtype(dtype).name, 1e-3)
 
 
-@partial(jax.jit, static_argnames=("method", "order"))
-def solved_with_normals(
-    method: NormalInterpolation,
-    order: tuple[int, int],
-    data: Float[Array, "n m 3"],
-    normals: Float[Array, "n m 3"],
-) -> NormalSolution:
-    """The whole fit."""
-    parameters = grid_parameters(data, method.parametrisation)
-    u, v = parameters.u, parameters.v
-    tangent_u = _flattened(slopes(u, order[0], data, 0), normals)
-    tangent_v = _flattened(slopes(v, order[1], data, 1), normals)
-    twist = 0.5 * (slopes(v, order[1], tangent_u, 1) + slopes(u, order[0], tangent_v, 0))
-    given = interleaved(interleaved(data, tangent_u, 0), interleaved(tangent_v, twist, 0), 1)
-    knots = [averaging_knots(jnp.repeat(t, 2), k) for t, k in zip((u, v), order, strict=True)]
-    bands = [banded.collocation_band(t, k, x, (0, 1)) for t, k, x in zip(knots, order, (u, v), strict=True)]
-    net = _solved(bands[1], _solved(bands[0], given, 0), 1)
-    # What the surface takes there, as it stands: values, derivatives along u and along v.
-    met = lax.stop_gradient(banded.times(bands[1], banded.times(bands[0], net, axis=0), axis=1))
-    on_rows, across_rows = parted(met, 1)
-    (values, derivative_u), (derivative_v, _) = parted(on_rows, 0), parted(across_rows, 0)
-    residual = jnp.sqrt(jnp.sum((lax.stop_gradient(data) - values) ** 2, axis=-1))
-    angles = angles_between(jnp.cross(derivative_u, derivative_v), lax.stop_gradient(normals))
-    return NormalSolution(net, (knots[0], knots[1]), (u, v), residual, angles, extent_of(data))
+def _checked_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    if normals is None:
+        raise ValueError(
+            "normals must be given for NormalInterpolation; pass unit vectors in the shape of the grid."
+        )
+    directions = as_floating("normals", normals, 3)
+    if grid.shape[2] != 3 or directions.shape != grid.shape:
+        raise ValueError(
+            f"normals must hold one vector in space for each point of the grid, but their shapes are "
+            f"{directions.shape} and {grid.shape}; give two arrays (n, m, 3)."
+        )
+    if min(order) < LEAST_ORDER:
+        raise ValueError(
+            f"order must be at least {LEAST_ORDER} in each direction to meet normals, but is {tuple(order)}; "
+            "raise it."
+        )
+    if is_concrete(directions):
+        lengths = np.linalg.norm(np.asarray(directions), axis=-1)
+        worst = np.unravel_index(np.argmax(np.abs(lengths - 1)), lengths.shape)
+        if abs(lengths[worst] - 1) > UNIT_TO:
+            raise ValueError(
+                f"normals must be unit vectors, but the one at {tuple(int(i) for i in worst)} has length "
+                f"{lengths[worst]:.3g}; divide each by its length."
+            )
+    return directions
 
 
 def slopes(u: Array, order: int, values: Float[Array, "n m d"], axis: int) -> Float[Array, "n m d"]:

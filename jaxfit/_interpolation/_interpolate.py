@@ -1,8 +1,8 @@
 """The verb for grids: a surface through all of them."""
 
-from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -16,25 +16,21 @@ from jaxfit._checks import (
     is_concrete,
 )
 from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._fit._scaling import unit_of
 from jaxfit._interpolation._geometric import GeometricInterpolation
-from jaxfit._interpolation._geometric_fit import geometric_fit
 from jaxfit._interpolation._hermite import NormalInterpolation
-from jaxfit._interpolation._hermite_fit import normal_fit
-from jaxfit._interpolation._standard import StandardInterpolation
-from jaxfit._interpolation._standard_fit import standard_fit
-from jaxfit._precision import working_dtype
-
-InterpolationMethod = GeometricInterpolation | StandardInterpolation | NormalInterpolation
+from jaxfit._interpolation._method import CORNERS, AbstractInterpolation, Frame, GridProblem, Progress
+from jaxfit._precision import interpolation_tolerance, working_dtype
 
 
 @eager_where_concrete
 def interpolate(
     grid: ArrayLike,
-    method: InterpolationMethod | None = None,
+    method: AbstractInterpolation | None = None,
     order: tuple[int, int] = (4, 4),
     tolerance: ArrayLike | None = None,
     max_steps: int = 1000,
-    progress: Callable[[int, int, float, float], None] | None = None,
+    progress: Progress | None = None,
     throw: bool = False,
     normals: ArrayLike | None = None,
 ) -> Fit:
@@ -89,18 +85,24 @@ def interpolate(
     data = _checked_grid(grid, order)
     if method is None:
         method = GeometricInterpolation() if normals is None else NormalInterpolation()
-    check_kind("method", method, InterpolationMethod, "GeometricInterpolation()")
-    if normals is not None and not isinstance(method, NormalInterpolation):
-        raise ValueError(
-            f"normals cannot be met by {type(method).__name__}; pass method=NormalInterpolation()."
-        )
-    if isinstance(method, NormalInterpolation):
-        fit = normal_fit(method, data, normals, order, tolerance)
-    elif isinstance(method, StandardInterpolation):
-        fit = standard_fit(method, data, order, tolerance, max_steps)
-    else:
-        fit = geometric_fit(method, data, order, tolerance, max_steps, progress)
+    check_kind("method", method, AbstractInterpolation, "GeometricInterpolation()")
+    normals = method.check_normals(normals, data, order)
+    fit = method.fit(_scaled(data, normals, order, tolerance, max_steps), progress)
     return converged_or_raise(fit) if throw else fit
+
+
+def _scaled(data: Any, normals: Any, order: tuple[int, int], tolerance: Any, max_steps: int) -> GridProblem:
+    """The problem in its own unit."""
+    unit = unit_of(data.reshape(-1, data.shape[2]), "points of grid")
+    dtype = working_dtype()
+    goal, tolerance = interpolation_tolerance(tolerance, dtype, unit.least_tolerance(dtype))
+    xp: Any = np if is_concrete(data, goal, tolerance) else jnp
+    diagonal, goal, tolerance = (xp.asarray(x, dtype) for x in (unit.diagonal / unit.scale, goal, tolerance))
+    inner, corners = unit.inward(data).astype(dtype), data[CORNERS].astype(dtype)
+    if normals is not None:
+        normals = np.asarray(normals, dtype) if is_concrete(normals) else normals.astype(dtype)
+    frame = Frame(unit.within(dtype), corners, diagonal, goal, tolerance, np.int32(max_steps))
+    return GridProblem(inner, normals, frame, unit, (int(order[0]), int(order[1])))
 
 
 def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:

@@ -8,24 +8,31 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest import Newton, project
+from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._measure import FOOT_STEPS
-from jaxfit._interpolation._collocation_systems import (
-    Account,
-    TensorCollocation,
-    distances,
-    improved,
-    point_collocation,
-)
-from jaxfit._splines._pieces import make_pieces
+from jaxfit._interpolation._gmres import Limits, append_errors, distances, gmres_solve
+from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
+from jaxfit._interpolation._solution_derivative import times_last
+from jaxfit._interpolation._tensor_collocation import TensorCollocation
+from jaxfit._splines._pieces import Axis, pieces_on
 
 
-class Task(eqx.Module):
+class CollocationProblem(eqx.Module):
     """The data, and what all solves share."""
 
     data: Float[Array, "n m d"]
     knots: tuple[Array, Array]
+    axes: tuple[Axis, Axis]
     tensor: TensorCollocation
-    limits: tuple[Array, Array, Array]  # diagonal, tolerance, most cycles
+    limits: Limits
+
+    def system(self, u: Array, v: Array) -> PointCollocation:
+        """The collocation matrix at the parameters (u, v) of every point."""
+        return point_collocation(self.axes, u, v)
+
+    def errors(self, net: Array, u: Array, v: Array) -> Array:
+        """Distances at the parameters."""
+        return distances(self.data - times_last(self.system(u, v), net), self.limits.diagonal)
 
 
 class Corrected(eqx.Module):
@@ -34,73 +41,66 @@ class Corrected(eqx.Module):
     net: Array
     u: Array
     v: Array
-    account: Account
+    step: Array  # cycles of GMRES so far
+    history: ErrorHistory
     number: Array  # of corrections
     change: Array
     lost: Array
     slow: Array
 
 
-def new_account(room: int, errors: Array) -> Account:
-    empty = jnp.full(room, jnp.nan, errors.dtype)
-    zero = jnp.asarray(0, jnp.int32)
-    return Account(zero, empty, empty).noted(zero, errors)
-
-
-def errors_at(order: tuple[int, int], task: Task, net: Array, u: Array, v: Array) -> Array:
-    """Distances at the parameters."""
-    return distances(task.data - point_collocation(task.knots, order, u, v).times(net), task.limits[0])
-
-
-def settled(
+def solved_at(
     method: Any,
-    order: tuple[int, int],
-    task: Task,
+    problem: CollocationProblem,
     net: Array,
     u: Array,
     v: Array,
-    account: Account,
+    step: Array,
+    history: ErrorHistory,
 ) -> Corrected:
-    """The system at these parameters, solved as well as it can be."""
-    system = point_collocation(task.knots, order, u, v)
-    net, account = improved(
-        system, task.tensor.factorised(), task.data, net, account, task.limits, method.restart
+    """The system at these parameters, solved as well as it can be.
+
+    It starts from `net`, that of `step` in `history`, where its errors still have to be entered.
+    """
+    system, precondition = problem.system(u, v), problem.tensor.factorised()
+    history = append_errors(history, step, problem.errors(net, u, v))
+    net, step, history = gmres_solve(
+        lambda x: times_last(system, x),
+        precondition,
+        problem.data,
+        net,
+        step,
+        history,
+        problem.limits,
+        method.restart,
     )
     zero = jnp.asarray(0, jnp.int32)
     far = jnp.asarray(jnp.inf, net.dtype)
-    return Corrected(net, u, v, account, zero, far, zero, jnp.asarray(False))
+    return Corrected(net, u, v, step, history, zero, far, zero, jnp.asarray(False))
 
 
-def corrected(method: Any, order: tuple[int, int], task: Task, found: Corrected) -> Corrected:
+def corrected(method: Any, problem: CollocationProblem, found: Corrected) -> Corrected:
     """Closest points and a new solve in turn, until the parameters rest, or neither they nor the errors
     come down any more."""
-    n, m, d = task.data.shape
-    diagonal, _, most = task.limits
-    target = task.data.reshape(n * m, d).T
+    n, m, d = problem.data.shape
+    limits = problem.limits
+    target = problem.data.reshape(n * m, d).T
     still = 100 * float(jnp.finfo(target.dtype).eps)
 
     def goes_on(now: Corrected) -> Array:
-        left = (now.number < method.max_corrections) & (now.account.step < most)
+        left = (now.number < method.max_corrections) & (now.step < limits.max_steps)
         return left & (now.change > still) & ~now.slow
 
     def correct(now: Corrected) -> Corrected:
-        pieces = make_pieces(now.net, *task.knots)
-        feet = project(
-            Newton(),
-            pieces,
-            target,
-            now.u.reshape(-1),
-            now.v.reshape(-1),
-            method.foot_tolerance * diagonal,
-            jnp.asarray(FOOT_STEPS, jnp.int32),
-        )
+        pieces = pieces_on(now.net, *problem.axes)
+        start, steps = (now.u.reshape(-1), now.v.reshape(-1)), jnp.asarray(FOOT_STEPS, jnp.int32)
+        feet = project(Newton(), pieces, target, *start, method.foot_tolerance * limits.diagonal, steps)
         u, v = feet.best_u.reshape(n, m), feet.best_v.reshape(n, m)
         change = jnp.maximum(jnp.max(jnp.abs(u - now.u)), jnp.max(jnp.abs(v - now.v)))
-        account = now.account.noted(now.account.step, errors_at(order, task, now.net, u, v))
-        new = settled(method, order, task, now.net, u, v, account)
-        step, before = new.account.step, now.account.maximum[now.account.step]
-        slow = (change > 0.9 * now.change) & (new.account.maximum[step] > 0.9 * before)
+        new = solved_at(method, problem, now.net, u, v, now.step, now.history)
+        before, after = now.history.at(now.step)[1], new.history.at(new.step)[1]
+        slow = (change > 0.9 * now.change) & (after > 0.9 * before)
         lost = jnp.sum(~feet.converged, dtype=jnp.int32)
-        return Corrected(new.net, u, v, new.account, now.number + 1, change, lost, slow)
+        return Corrected(new.net, u, v, new.step, new.history, now.number + 1, change, lost, slow)
 
     return lax.while_loop(goes_on, correct, found)

@@ -10,7 +10,7 @@ from equinox import AbstractClassVar
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._interpolation._tensor_collocation import Windows, basis_at
+from jaxfit._interpolation._point_collocation import PointCollocation, basis_at
 from jaxfit._splines._pieces import Axis
 
 POWER_ITERATIONS = 100
@@ -22,7 +22,7 @@ class AbstractRepositioning(eqx.Module):
     needs_spectrum: AbstractClassVar[bool]
 
     @abstractmethod
-    def weights(self, windows: Windows, lowest: Array) -> Float[Array, "nu nv"]:
+    def weights(self, collocation: PointCollocation, lowest: Array) -> Float[Array, "nu nv"]:
         """Of every control point; `lowest` is the smallest eigenvalue of the collocation matrix."""
 
 
@@ -31,9 +31,9 @@ class UnitWeights(AbstractRepositioning):
 
     needs_spectrum: ClassVar[bool] = False
 
-    def weights(self, windows: Windows, lowest: Array) -> Float[Array, "nu nv"]:
+    def weights(self, collocation: PointCollocation, lowest: Array) -> Float[Array, "nu nv"]:
         """Ones."""
-        return jnp.ones_like(windows.basis_u[0])
+        return jnp.ones_like(collocation.basis_u[0])
 
 
 class OptimalRepositioning(AbstractRepositioning):
@@ -46,10 +46,10 @@ class OptimalRepositioning(AbstractRepositioning):
 
     needs_spectrum: ClassVar[bool] = False
 
-    def weights(self, windows: Windows, lowest: Array) -> Float[Array, "nu nv"]:
+    def weights(self, collocation: PointCollocation, lowest: Array) -> Float[Array, "nu nv"]:
         """Equation (27)."""
-        own_u, own_v = windows.own()
-        squares = jnp.sum(windows.basis_u**2, axis=0) * jnp.sum(windows.basis_v**2, axis=0)
+        own_u, own_v = collocation.own()
+        squares = jnp.sum(collocation.basis_u**2, axis=0) * jnp.sum(collocation.basis_v**2, axis=0)
         own = own_u * own_v
         return jnp.where(own > 0, own / squares, 1.0)
 
@@ -62,9 +62,9 @@ class ConstantWeight(AbstractRepositioning):
 
     needs_spectrum: ClassVar[bool] = True
 
-    def weights(self, windows: Windows, lowest: Array) -> Float[Array, "nu nv"]:
+    def weights(self, collocation: PointCollocation, lowest: Array) -> Float[Array, "nu nv"]:
         """Equation (17)."""
-        return jnp.full_like(windows.basis_u[0], 2.0 / (1.0 + lowest))
+        return jnp.full_like(collocation.basis_u[0], 2.0 / (1.0 + lowest))
 
 
 @jax.jit

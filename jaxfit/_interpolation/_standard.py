@@ -1,33 +1,32 @@
 """Standard interpolation of grids: the collocation system of sections 2.2 and 3 of the paper."""
 
-import equinox as eqx
+from typing import Any
+
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
-from jaxtyping import Float
 
 from jaxfit._checks import check_kind, check_number
-from jaxfit._interpolation._collocation_systems import (
-    Account,
-    distances,
-    tensor_collocation,
-    with_derivative,
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._reasons import RESULTS, code_of
+from jaxfit._interpolation._gmres import Limits, distances
+from jaxfit._interpolation._method import (
+    AbstractDirectInterpolation,
+    GridProblem,
+    Solution,
+    errors_only,
+    refuse_normals,
+    single_entry,
 )
-from jaxfit._interpolation._outcome import extent_of
-from jaxfit._interpolation._parameter_correction import (
-    Corrected,
-    Task,
-    corrected,
-    errors_at,
-    new_account,
-    settled,
-)
+from jaxfit._interpolation._parameter_correction import CollocationProblem, corrected, solved_at
+from jaxfit._interpolation._solution_derivative import with_derivative
+from jaxfit._interpolation._tensor_collocation import tensor_collocation
 from jaxfit._parameters import AbstractParametrisation, ChordLength, grid_parameters
 from jaxfit._splines import averaging_knots
+from jaxfit._splines._pieces import make_axis
 
-Pair = tuple[Array, Array]
 
-
-class StandardInterpolation(eqx.Module):
+class StandardInterpolation(AbstractDirectInterpolation):
     r"""Solve the linear system $\sum_{kl} N_k(u_{ij}) N_l(v_{ij}) P_{kl} = Q_{ij}$ for the control points.
 
     By default all points of a row share $u_i$ and all points of a column share $v_j$, the averages
@@ -92,89 +91,65 @@ class StandardInterpolation(eqx.Module):
         """Whether more than the tensor product is to be solved."""
         return self.per_point or self.parameter_correction
 
+    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+        """None can be met."""
+        refuse_normals(self, normals)
 
-class Solution(eqx.Module):
-    """What the traced part returns; lengths in the problem's unit, errors as fractions of the diagonal."""
-
-    net: Float[Array, "n m d"]
-    knots: Pair
-    u: Float[Array, "n m"]
-    v: Float[Array, "n m"]
-    errors: Float[Array, "n m"]
-    account: Account
-    average: Array
-    maximum: Array
-    extent: Float[Array, "2"]
-    corrections: Array
-    parameter_change: Array
-    lost: Array  # closest points not found to the tolerance
-
-
-def solved(
-    method: StandardInterpolation,
-    order: tuple[int, int],
-    room: int,
-    data: Float[Array, "n m d"],
-    limits: tuple[Array, Array, Array],
-) -> Solution:
-    """The whole fit; `room` is the length of the history."""
-    n, m, _ = data.shape
-    parameters = grid_parameters(data, method.parametrisation)
-    averaged = parameters.u, parameters.v
-    knots = averaging_knots(averaged[0], order[0]), averaging_knots(averaged[1], order[1])
-    tensor = tensor_collocation(knots, order, *averaged)
-    net = tensor.solve(data)
-    task = Task(data, knots, tensor, limits)
-    if method.per_point:
-        u, v = parameters.rows_u, parameters.rows_v
-    else:
-        u = jnp.broadcast_to(averaged[0][:, None], (n, m))
-        v = jnp.broadcast_to(averaged[1][None, :], (n, m))
-    if method.iterative:
-        return _iterated(method, order, room, task, net, u, v)
-    errors = lax.stop_gradient(distances(data - tensor.times(net), limits[0]))
-    zero = jnp.asarray(0, jnp.int32)
-    rest = jnp.zeros((), data.dtype)
-    found = Corrected(net, u, v, new_account(room, errors), zero, rest, zero, jnp.asarray(False))
-    return _solution(task, net, u, v, errors, found)
+    def solve(self, problem: GridProblem, history: ErrorHistory) -> Solution:
+        """The tensor product, and where asked the general system after it."""
+        data, order, frame = problem.data, problem.order, problem.frame
+        parameters = grid_parameters(data, self.parametrisation)
+        averaged = parameters.u, parameters.v
+        knots = averaging_knots(averaged[0], order[0]), averaging_knots(averaged[1], order[1])
+        tensor = tensor_collocation(knots, order, *averaged)
+        net = tensor.solve(data)
+        if self.per_point:
+            u, v = parameters.rows_u, parameters.rows_v
+        else:
+            u = jnp.broadcast_to(averaged[0][:, None], data.shape[:2])
+            v = jnp.broadcast_to(averaged[1][None, :], data.shape[:2])
+        limits = Limits(frame.diagonal, frame.goal, frame.max_steps)
+        if self.iterative:
+            axes = make_axis(knots[0], order[0], simple=True), make_axis(knots[1], order[1], simple=True)
+            system = CollocationProblem(data, knots, axes, tensor, limits)
+            return _iterated(self, system, net, u, v, history)
+        errors = distances(lax.stop_gradient(data - tensor.times(net)), frame.diagonal)
+        zero = np.int32(0)
+        code = _ending(jnp.max(errors) <= frame.goal, RESULTS.stalled)
+        stats = {"corrections": zero, "parameter_change": np.zeros((), data.dtype)}
+        return Solution(net, knots, u, v, errors, single_entry(errors), code, zero, zero, stats)
 
 
-def _solution(task: Task, net: Array, u: Array, v: Array, errors: Array, found: Corrected) -> Solution:
-    account = found.account
-    return Solution(
-        net=net,
-        knots=task.knots,
-        u=u,
-        v=v,
-        errors=errors,
-        account=account,
-        average=account.average[account.step],
-        maximum=account.maximum[account.step],
-        extent=extent_of(task.data),
-        corrections=found.number,
-        parameter_change=jnp.where(found.number > 0, found.change, 0.0),
-        lost=found.lost,
-    )
+def _ending(met: Array, missed: Any) -> Array:
+    return jnp.where(met, np.int32(code_of(RESULTS.converged)), np.int32(code_of(missed)))
 
 
 def _iterated(
     method: StandardInterpolation,
-    order: tuple[int, int],
-    room: int,
-    task: Task,
+    problem: CollocationProblem,
     net: Array,
     u: Array,
     v: Array,
+    history: ErrorHistory,
 ) -> Solution:
     """The general system, from the net of the tensor product, and corrections of the parameters."""
-    fixed, net, start_u, start_v = lax.stop_gradient((task, net, u, v))
-    errors = errors_at(order, fixed, net, start_u, start_v)
-    found = settled(method, order, fixed, net, start_u, start_v, new_account(room, errors))
+    fixed, net, start_u, start_v = lax.stop_gradient((problem, net, u, v))
+    found = solved_at(method, fixed, net, start_u, start_v, jnp.zeros((), jnp.int32), history)
     if method.parameter_correction:
-        found = corrected(method, order, fixed, found)
+        found = corrected(method, fixed, found)
     found = lax.stop_gradient(found)
     # Derivatives see the first parameters, moved by constants.
     u, v = u + (found.u - start_u), v + (found.v - start_v)
-    net = with_derivative(order, method.restart, found.net, (u, v), task.knots, task.tensor, task.data)
-    errors = errors_at(order, fixed, found.net, found.u, found.v)
-    return _solution(task, net, u, v, errors, found)
+    net = with_derivative(method.restart, found.net, (u, v), problem.axes, problem.tensor, problem.data)
+    errors = fixed.errors(found.net, found.u, found.v)
+    goal, most = problem.limits.tolerance, problem.limits.max_steps
+    met = jnp.max(errors) <= goal
+    code = jnp.where(
+        found.step >= most, _ending(met, RESULTS.max_steps_reached), _ending(met, RESULTS.stalled)
+    )
+    stats = {
+        "corrections": found.number,
+        "parameter_change": jnp.where(found.number > 0, found.change, 0.0),
+    }
+    past = errors_only(found.history, found.step)
+    return Solution(net, problem.knots, u, v, errors, past, code, found.step, found.lost, stats)

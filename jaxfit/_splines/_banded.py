@@ -9,6 +9,7 @@ step works on whole rows of right-hand sides: one loop over rows with all column
 than a dense or a blocked factorisation up to 400 rows and more.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
@@ -58,10 +59,10 @@ def times(band: Float[Array, "n band"], x: Float[Array, "..."], axis: int = 0) -
     count, width = band.shape
     reach = (width - 1) // 2
     padded = jnp.pad(x, [(reach, reach) if each == axis else (0, 0) for each in range(x.ndim)])
-    column = [count if each == axis else 1 for each in range(x.ndim)]
+    diagonals = lax.broadcast_in_dim(band.T, (width, *x.shape), (0, axis + 1))
     total = jnp.zeros_like(x)
     for k in range(width):
-        total = total + band[:, k].reshape(column) * lax.slice_in_dim(padded, k, k + count, axis=axis)
+        total = total + diagonals[k] * lax.slice_in_dim(padded, k, k + count, axis=axis)
     return total
 
 
@@ -109,17 +110,24 @@ def substitute(factors: tuple[Array, Array], right: Float[Array, "n columns"]) -
     return lax.scan(backward, none, (upper, half), reverse=True, unroll=UNROLL)[1]
 
 
+@jax.custom_jvp
 def solve(band: Float[Array, "n band"], right: Float[Array, "n columns"]) -> Float[Array, "n columns"]:
     """The solution of the banded system, differentiable in the matrix and in the right-hand sides.
 
     Derivatives are those of the solution, not of the elimination: they cost one more solve, with the
     transposed band in reverse mode.
     """
-    fixed = lax.stop_gradient(band)
-    factors = factorise(fixed)
-    return lax.custom_linear_solve(
+    return substitute(factorise(band), right)
+
+
+@solve.defjvp
+def _solve_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    (band, _), (d_band, d_right) = primals, tangents
+    solution, fixed = solve(*primals), lax.stop_gradient(band)
+    change = lax.custom_linear_solve(
         lambda x: times(band, x),
-        right,
-        solve=lambda _, b: substitute(factors, b),
+        d_right - times(d_band, solution),
+        solve=lambda _, b: substitute(factorise(fixed), b),
         transpose_solve=lambda _, b: substitute(factorise(transposed(fixed)), b),
     )
+    return solution, change

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfit._checks import as_direction, as_floating, as_vector, is_concrete
-from jaxfit._splines import _mirror
+from jaxfit._splines import _reflection_kernels as kernels
 
 Vector = ArrayLike | Sequence[float | int]
 
@@ -89,8 +89,8 @@ class Reflection(eqx.Module):
         rows = self._rows("grid", grid)
         point = jnp.mean(rows, axis=(0, 1)) if self.point is None else jnp.asarray(self.point, rows.dtype)
         if self.normal is not None:
-            return point, _mirror.unit(jnp.asarray(self.normal, rows.dtype))
-        normal, clear = _mirror.best_normal(rows, point)
+            return point, kernels.unit(jnp.asarray(self.normal, rows.dtype))
+        normal, clear = kernels.best_normal(rows, point)
         if is_concrete(clear) and not bool(clear):
             raise ValueError(
                 "grid has no plane of symmetry for this pairing, since the differences between paired "
@@ -127,7 +127,7 @@ class Reflection(eqx.Module):
         array = jnp.asarray(as_floating("points", points, np.ndim(points)))
         self._check_dimension("points", array)
         point, normal = (jnp.asarray(x, array.dtype) for x in (self.point, self.normal))
-        return _mirror.mirrored(array, point, _mirror.unit(normal))
+        return kernels.mirrored(array, point, kernels.unit(normal))
 
     def symmetrise_points(self, grid: ArrayLike) -> Float[Array, "n m d"]:
         """The symmetric grid nearest to `grid` (n, m, d), in the sense of least squares.
@@ -139,9 +139,9 @@ class Reflection(eqx.Module):
         rows = self._rows("grid", grid)
         point, normal = self.plane(grid)
         half = rows.shape[0] // 2
-        first = _mirror.averaged(rows[:half], rows[::-1][:half], point, normal)
-        middle = _mirror.onto_plane(rows[half : rows.shape[0] - half], point, normal)
-        last = _mirror.mirrored(first, point, normal)[::-1]
+        first = kernels.averaged(rows[:half], rows[::-1][:half], point, normal)
+        middle = kernels.onto_plane(rows[half : rows.shape[0] - half], point, normal)
+        last = kernels.mirrored(first, point, normal)[::-1]
         return jnp.moveaxis(jnp.concatenate([first, middle, last]), 0, self.axis)
 
     def symmetrise_parameters(self, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
@@ -164,7 +164,7 @@ class Reflection(eqx.Module):
             )
         both = [u, v]
         ends = [jnp.asarray(x, u.dtype) for x in (0.0, 1.0)]
-        both[self.axis] = self._along(lambda t: _mirror.reversal_mean(t, *ends), both[self.axis])
+        both[self.axis] = self._along(lambda t: kernels.reversal_mean(t, *ends), both[self.axis])
         if u.ndim == 2:
             both[1 - self.axis] = self.symmetrise_values(both[1 - self.axis])
         return both[0], both[1]
@@ -176,7 +176,7 @@ class Reflection(eqx.Module):
         other direction need nothing.
         """
         values = jnp.asarray(as_floating("knots", knots, 1))
-        return _mirror.reversal_mean(values, values[0], values[-1])
+        return kernels.reversal_mean(values, values[0], values[-1])
 
     def symmetrise_values(self, values: ArrayLike) -> Array:
         """The mean of each pair of numbers (n, m), such as weights of the points of a grid."""
@@ -193,8 +193,8 @@ class Reflection(eqx.Module):
         point, normal = self.plane(net)
         half = (rows.shape[0] + 1) // 2
         # An isometry that is its own inverse: the other half deviates as much.
-        return _mirror.largest_distance(
-            _mirror.mirrored(rows[:half], point, normal), rows[rows.shape[0] - half :][::-1]
+        return kernels.largest_distance(
+            kernels.mirrored(rows[:half], point, normal), rows[rows.shape[0] - half :][::-1]
         )
 
     def _rows(self, name: str, grid: ArrayLike) -> Array:
