@@ -1,6 +1,7 @@
 """The four boundary polylines of a patch, checked and with common corners."""
 
 from itertools import product
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._checks import as_floating, as_points, check_number, is_concrete
 
 # The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
 _CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
@@ -48,8 +49,9 @@ class Boundary(eqx.Module):
         v1: ArrayLike,
         u0: ArrayLike,
         u1: ArrayLike,
-        tolerance: float = 1e-6,
+        tolerance: ArrayLike = 1e-6,
     ):
+        check_number("tolerance", tolerance, 0.0)
         given = {"v0": v0, "v1": v1, "u0": u0, "u1": u1}
         lines = {name: as_points(name, x, least=2) for name, x in given.items()}
         for name, line in lines.items():
@@ -105,7 +107,7 @@ def _box(sets: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
     return low.astype(float), high.astype(float)
 
 
-def _cleaned(lines: dict[str, np.ndarray], tolerance: float) -> dict[str, np.ndarray]:
+def _cleaned(lines: dict[str, np.ndarray], tolerance: Any) -> dict[str, np.ndarray]:
     magnitude = max(float(np.abs(x).max()) for x in lines.values())
     eps = float(jnp.finfo(lines["v0"].dtype).eps)
     rounding, size = 4 * eps * magnitude, diagonal(*lines.values())

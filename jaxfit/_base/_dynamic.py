@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._cloud import Cloud, thinned
+from jaxfit._base._base_method import AbstractBaseMethod
+from jaxfit._base._directed_projection import directed_projection, mean_distance, reach_of
 from jaxfit._base._grid_smoothing import smoothed
-from jaxfit._base._host_splines import Frame, applied, basis_matrix, greville
-from jaxfit._base._method import AbstractBaseMethod, Knots
-from jaxfit._base._pull import mean_distance, pull, reach_of
+from jaxfit._base._host_splines import Frame, Knots, applied, basis_matrix
+from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
+from jaxfit._splines._knots import greville
 
 GAIN = 0.01  # a mean distance has fallen if it did so by this share
 IDLE = 2  # grids that lower nothing before the end
@@ -118,7 +119,9 @@ class DynamicBaseSurface(AbstractBaseMethod):
         for _ in range(self.rounds):
             grid, normals = level.frame.points(net), level.frame.normals(net)
             reach = reach_of(grid, points, self.reach)
-            moves, sure = pull(grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points)
+            moves, sure = directed_projection(
+                grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points
+            )
             moved = grid - level.base + moves.reshape(reach.shape)[..., None] * normals
             net = level.interpolated(smoothed(moved, sure.reshape(reach.shape), self.stiffness))
             distance = mean_distance(net, level.knots, level.order, points)

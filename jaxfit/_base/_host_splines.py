@@ -17,13 +17,6 @@ def basis_matrix(
     return BSpline(knots, np.eye(len(knots) - order), order - 1)(u, derivative)
 
 
-def greville(knots: Float[Any, " knots"], order: int) -> Float[Any, " n"]:
-    """Means of order - 1 consecutive knots: where interpolation is always possible."""
-    sums = np.cumsum(np.concatenate([[0.0], knots]))
-    places = (sums[order : len(knots)] - sums[1 : len(knots) - order + 1]) / (order - 1)
-    return np.clip(places, knots[0], knots[-1])
-
-
 def applied(
     first: Float[Any, "a n"], net: Float[Any, "n m d"], second: Float[Any, "b m"]
 ) -> Float[Any, "a b d"]:

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._cloud import Cloud, thinned
-from jaxfit._base._host_splines import Frame
+from jaxfit._base._arc_length import along_sides
+from jaxfit._base._base_method import AbstractBaseMethod
+from jaxfit._base._held_border_fit import robust_held_fit
+from jaxfit._base._host_splines import Frame, Knots
 from jaxfit._base._meshless_parameters import parameters_of
-from jaxfit._base._method import AbstractBaseMethod, Knots
-from jaxfit._base._reparametrise import along_sides
-from jaxfit._base._thin_plate import robust_held_fit
+from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
 
 FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
@@ -87,7 +87,7 @@ class Meshless(AbstractBaseMethod):
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
         most = FARTHEST * max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
-        tame: list[np.ndarray] = []
+        bounded: list[np.ndarray] = []
         for power in range(STIFFENINGS):
             smoothing = self.smoothing * 10.0**power
             found = robust_held_fit(net, knots, order, places, points, smoothing, self.robust)
@@ -95,10 +95,10 @@ class Meshless(AbstractBaseMethod):
                 continue
             if not _folds_across_gaps(found, knots, order, places):
                 return found
-            tame.append(found)
-            if len(tame) > UNFOLDINGS:
+            bounded.append(found)
+            if len(bounded) > UNFOLDINGS:
                 break
-        return tame[0] if tame else found
+        return bounded[0] if bounded else found
 
 
 def _folds_across_gaps(

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxfit._splines._basis import as_parameters
 from jaxfit._splines._bezier import BezierCurves, bezier_along
-from jaxfit._splines._construct import checked_derivative, checked_net, checked_new_knots
+from jaxfit._splines._checked_arguments import checked_derivative, checked_net, checked_new_knots
 from jaxfit._splines._evaluate import evaluate_curve
 from jaxfit._splines._insertion import insert_along
 from jaxfit._splines._knots import greville_abscissae

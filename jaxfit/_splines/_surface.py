@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxfit._splines import _geometry
 from jaxfit._splines._basis import as_parameters
 from jaxfit._splines._bezier import BezierPatches, bezier_along
-from jaxfit._splines._construct import (
+from jaxfit._splines._checked_arguments import (
     checked_derivative,
     checked_net,
     checked_new_knots,

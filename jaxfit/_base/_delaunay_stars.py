@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._base._normals import frames, oriented
+from jaxfit._base._point_normals import frames, oriented
 
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many

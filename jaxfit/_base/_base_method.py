@@ -7,11 +7,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._cloud import Cloud
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae
+from jaxfit._base._host_splines import Knots
+from jaxfit._base._normalised_cloud import Cloud
 from jaxfit._checks import check_kind
-
-Knots = tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]]
 
 
 class AbstractBaseMethod(eqx.Module):
@@ -40,7 +39,7 @@ class Coons(eqx.Module):
         check_kind("abscissae", self.abscissae, AbstractAbscissae, "Greville()")
 
 
-def refined(
+def halve_widest_spans(
     net: np.ndarray, knots: np.ndarray, order: int, axis: int, wanted: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Net and knots after halving the widest spans until there are `wanted` control points along an axis.
