@@ -28,9 +28,25 @@ class AbstractBaseMethod(eqx.Module):
 
 
 class Coons(eqx.Module):
-    """The Coons surface of the boundary itself; it does not look at the points.
+    """The Coons surface of the boundary itself, equations (6)-(7); it does not look at the points.
 
-    `abscissae`: `Greville()` (default) or `Uniform()`, as in `coons_surface`.
+    Parameters
+    ----------
+    abscissae : Greville() or Uniform()
+        Default `Greville()`; see `coons_surface`.
+
+    Raises
+    ------
+    TypeError
+        If `abscissae` is neither.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5), indexing="ij")
+    >>> boundary = jf.Boundary.from_grid(np.stack([x, y, x * y], axis=2))
+    >>> x, y, z = jf.base_surface(boundary, net=(4, 4), method=jf.Coons())(0.5, 0.5).tolist()
+    >>> abs(z - x * y) < 0.01
+    True
     """
 
     abscissae: AbstractAbscissae = GREVILLE

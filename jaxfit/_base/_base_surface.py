@@ -87,6 +87,13 @@ def base_surface(
     (two if K and L differ), padded so that boundaries of similar size share it.
 
     Sources: paper sections 2.3 and 4.1, equations (5)-(7), Algorithm 1 for curves.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5), indexing="ij")
+    >>> surface = jf.base_surface(jf.Boundary.from_grid(np.stack([x, y, x * y], axis=2)), net=(4, 4))
+    >>> surface.shape, surface.order, surface(1.0, 1.0).tolist()
+    ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
     order, net = _checked(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")

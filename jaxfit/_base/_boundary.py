@@ -24,18 +24,38 @@ class Boundary(eqx.Module):
          |                |
         c00 ---- v0 ---> c10
 
-    `v0` and `v1` are the sides v = 0 and v = 1, along which u grows; `u0` and `u1` the sides
-    u = 0 and u = 1, along which v grows.
+    `v0` and `v1` are the sides v = 0 and v = 1, along which u grows; `u0` and `u1` are the sides
+    u = 0 and u = 1, along which v grows. A polyline may be closed: opposite corners then coincide,
+    as on a tube.
 
-    Parameters: each polyline (n_i, d) with n_i >= 2 vertices and a common d, any unit, vertices in
-    order. Ends that should meet may differ by `tolerance` (default 1e-6) times the bounding-box
-    diagonal: the u-polyline's end is then moved onto the v-polyline's. Consecutive duplicates
-    are dropped.
+    Parameters
+    ----------
+    v0, v1, u0, u1 : arrays (n_i, d)
+        At least two vertices each, in order, in any unit. Consecutive duplicates are dropped.
+    tolerance : float
+        How far ends that should meet may be apart, as a fraction of the bounding-box diagonal
+        (default 1e-6, at least 0). The end of the u-polyline moves onto that of the v-polyline.
 
-    Raises ValueError, naming the polyline, for too few vertices, NaNs, different d, a polyline of
-    length zero (patches with three sides are not supported) and corners that do not meet. A
-    polyline may be closed: opposite corners then coincide, as on a tube. Inside `jit` only
-    shapes are checked and the vertices are taken as they are.
+    Raises
+    ------
+    ValueError
+        For too few vertices, numbers that are not finite, masked entries, different d, a polyline of
+        length zero (patches with three sides are not supported), corners that do not meet, or a
+        tolerance that is negative or not finite. Inside `jit` only shapes are checked, and the
+        vertices are taken as they are.
+    TypeError
+        If the tolerance is no number, or the polylines are not real.
+
+    Examples
+    --------
+    >>> boundary = jf.Boundary(
+    ...     v0=np.array([[0.0, 0.0], [1.0, 0.0]]),
+    ...     v1=np.array([[0.0, 2.0], [1.0, 2.0]]),
+    ...     u0=np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]),
+    ...     u1=np.array([[1.0, 0.0], [1.0, 2.0]]),
+    ... )
+    >>> boundary.u0.shape
+    (3, 2)
     """
 
     v0: Float[Array, "v0_points d"]

@@ -64,10 +64,22 @@ class DynamicBaseSurface(AbstractBaseMethod):
     the paper: displacements are smoothed rather than positions, and a pull counts less where few
     points are near the normal line.
 
-    Raises ValueError for options out of range, and for surfaces outside three dimensions.
-
     Source: P. N. Azariadis, Parameterization of clouds of unorganized points using dynamic base surfaces,
     Computer-Aided Design 36 (2004).
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, or the boundary is not in three dimensions.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, 1, 13), indexing="ij")
+    >>> grid = np.stack([x, y, 4 * x * (1 - x) * y * (1 - y)], axis=2)
+    >>> boundary, points = jf.Boundary.from_grid(grid), grid[1:-1, 1:-1].reshape(-1, 3)
+    >>> surface = jf.base_surface(boundary, points, net=(8, 8), method=jf.DynamicBaseSurface())
+    >>> abs(float(surface(0.5, 0.5)[2]) - 0.25) < 0.05
+    True
     """
 
     start: int = 4

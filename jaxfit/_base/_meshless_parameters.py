@@ -84,6 +84,16 @@ def meshless_parameters(
     Sources: M. S. Floater, M. Reimers, Meshless parameterization and surface reconstruction, CAGD 18 (2001);
     S. Yoshizawa, A. Belyaev, H.-P. Seidel, A fast and simple stretch-minimizing mesh parameterization,
     Shape Modeling International (2004).
+
+    Examples
+    --------
+    Points of a flat square keep their places:
+
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7), indexing="ij")
+    >>> grid = np.stack([x, y, 0 * x], axis=2)
+    >>> u, v = jf.meshless_parameters(grid[1:-1, 1:-1].reshape(-1, 3), jf.Boundary.from_grid(grid))
+    >>> bool(np.allclose(u, x[1:-1, 1:-1].ravel(), atol=1e-6))
+    True
     """
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     check_number("neighbours", neighbours, 6, whole=True)

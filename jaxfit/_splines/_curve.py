@@ -45,6 +45,15 @@ class BSplineCurve(eqx.Module):
     derivative at a knot is the one from the right, at the right end the one from the left.
     Parameters outside the domain are moved to its nearest end unless `extrapolate=True`, which
     continues the end pieces; NaN in gives NaN out.
+
+    Examples
+    --------
+    A parabola, its point and its tangent in the middle:
+
+    >>> points, knots = np.array([[0.0, 0.0], [0.5, 1.0], [1.0, 0.0]]), np.array([0.0, 0, 0, 1, 1, 1])
+    >>> curve = jf.BSplineCurve(points, knots)
+    >>> curve.order, curve(0.5).tolist(), curve.derivative(0.5).tolist()
+    (3, [0.5, 0.5], [1.0, 0.0])
     """
 
     control_points: Float[Array, "n d"]

@@ -29,6 +29,13 @@ def clamped_uniform_knots(
     ------
     ValueError
         If there are fewer control points than the order, or the domain is empty.
+
+    Examples
+    --------
+    Two spans of a cubic:
+
+    >>> print(jf.clamped_uniform_knots(5, 4))
+    [0.  0.  0.  0.  0.5 1.  1.  1.  1. ]
     """
     _check_count("count", count, order)
     xp: Any = np if is_concrete(domain) else jnp
@@ -67,6 +74,11 @@ def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]
     ValueError
         If there are fewer parameters than the order, the order is below 2, or the parameters
         decrease somewhere.
+
+    Examples
+    --------
+    >>> print(np.round(jf.averaging_knots(np.array([0.0, 0.1, 0.2, 0.6, 1.0]), 4), 3))
+    [0.  0.  0.  0.  0.3 1.  1.  1.  1. ]
     """
     values = as_floating("parameters", parameters, 1)
     count = values.shape[0]
@@ -102,6 +114,20 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
     knots : array (count + order,)
     order : int
         Degree + 1, at least 2.
+
+    Returns
+    -------
+    array (count,)
+
+    Raises
+    ------
+    ValueError
+        If the order is below 2 or not below the number of knots.
+
+    Examples
+    --------
+    >>> print(np.round(jf.greville_abscissae(jf.clamped_uniform_knots(5, 4), 4), 3))
+    [0.    0.167 0.5   0.833 1.   ]
     """
     values = as_floating("knots", knots, 1)
     if not 2 <= order < values.shape[0]:
@@ -133,6 +159,14 @@ def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) 
     ------
     ValueError
         If a vector decreases, or the two domains differ by more than `tolerance`.
+    TypeError
+        If a vector is traced: the length of the result depends on the values.
+
+    Examples
+    --------
+    >>> a, b = np.array([0.0, 0.0, 0.5, 1.0, 1.0]), np.array([0.0, 0.0, 0.25, 0.5, 0.5, 1.0, 1.0])
+    >>> print(jf.merge_knots(a, b, 2))
+    [0.   0.   0.25 0.5  0.5  1.   1.  ]
     """
     if not is_concrete(a, b):
         raise TypeError("merge_knots needs concrete knots, but was traced; call it outside jit.")
