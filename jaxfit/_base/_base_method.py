@@ -4,7 +4,6 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae
@@ -53,21 +52,3 @@ class Coons(eqx.Module):
 
     def __check_init__(self) -> None:
         check_kind("abscissae", self.abscissae, AbstractAbscissae, "Greville()")
-
-
-def halve_widest_spans(
-    net: np.ndarray, knots: np.ndarray, order: int, axis: int, wanted: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Net and knots after halving the widest spans until there are `wanted` control points along an axis.
-
-    Exact: the surface stays.
-    """
-    from scipy.interpolate import BSpline
-
-    curve = BSpline(knots, np.moveaxis(net, axis, 0), order - 1)
-    while len(curve.t) - order < wanted:
-        widths = np.diff(curve.t)
-        widest = int(np.argmax(widths > widths.max() * (1 - 1e-9)))
-        curve = curve.insert_knot((curve.t[widest] + curve.t[widest + 1]) / 2)
-    count = len(curve.t) - order
-    return np.moveaxis(curve.c[:count], 0, axis), curve.t

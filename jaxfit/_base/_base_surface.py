@@ -5,15 +5,16 @@ import operator
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._base._base_method import AbstractBaseMethod, Coons, halve_widest_spans
+from jaxfit._base._base_method import AbstractBaseMethod, Coons
 from jaxfit._base._boundary import Boundary, farthest, frame
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._default_net import default_net
+from jaxfit._base._host_splines import halve_widest_spans
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
 from jaxfit._base._same_place import check_same_place
-from jaxfit._checks import as_points, check_kind, check_number, eager_where_concrete, is_concrete
+from jaxfit._checks import as_points, check_kind, check_number, check_order, eager_where_concrete, is_concrete
 from jaxfit._splines import BSplineSurface
 
 MAX_STEPS = 100  # of the curve fit; few curves use them up
@@ -95,7 +96,7 @@ def base_surface(
     >>> surface.shape, surface.order, surface(1.0, 1.0).tolist()
     ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
-    order, net = _checked(boundary, net, order, tolerance)
+    net = _checked_net(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     sides = [np.asarray(x) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
@@ -117,21 +118,14 @@ def base_surface(
     if isinstance(method, AbstractBaseMethod):
         cloud = cloud_of(clouds[0], boundary)
         if net is None:
-            placed, pair = _refined(placed, pair, order, default_net(len(cloud.points), boundary, order))
+            placed, pair = halve_widest_spans(
+                placed, pair, order, default_net(len(cloud.points), boundary, order)
+            )
         placed = method.fill(placed, pair, order, cloud)
     placed = (placed * size + centre).astype(dtype)
     for j, side in ((0, sides[0]), (-1, sides[1])):  # the corners to the last bit
         placed[0, j], placed[-1, j] = side[0], side[-1]
     return BSplineSurface(placed, *(x.astype(dtype) for x in pair))
-
-
-def _refined(
-    net: np.ndarray, knots: tuple[np.ndarray, np.ndarray], order: tuple[int, int], least: tuple[int, int]
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """The same surface with at least so many control points."""
-    net, knots_u = halve_widest_spans(net, knots[0], order[0], 0, least[0])
-    net, knots_v = halve_widest_spans(net, knots[1], order[1], 1, least[1])
-    return net, (knots_u, knots_v)
 
 
 def _check_cloud(method: Coons | AbstractBaseMethod | None, points: ArrayLike | None, dimension: int) -> None:
@@ -173,12 +167,12 @@ def _curves(
     ]
 
 
-def _checked(
+def _checked_net(
     boundary: Boundary,
     net: tuple[int, int] | None,
     order: tuple[int, int],
     tolerance: float,
-) -> tuple[tuple[int, int], tuple[int, int] | None]:
+) -> tuple[int, int] | None:
     if not isinstance(boundary, Boundary):
         raise TypeError(
             f"boundary must be a Boundary, but is a {type(boundary).__name__}; build one with "
@@ -192,30 +186,22 @@ def _checked(
     check_number("tolerance", tolerance, 0.0)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")
-    order = _pair("order", order)
-    if not all(2 <= each <= 8 for each in order):
-        raise ValueError(f"order must be 2 to 8 in each direction, but is {order}; change it.")
+    check_order(order)
     if net is None:
-        return order, None
-    net = _pair("net", net)
-    if net[0] < order[0] or net[1] < order[1]:
-        raise ValueError(
-            f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
-            f"is {net[0]} x {net[1]}; enlarge it or lower the order."
-        )
-    if net[0] * net[1] > LARGEST_NET:
-        raise ValueError(
-            f"net must have at most {LARGEST_NET} control points, but {net[0]} x {net[1]} are asked "
-            "for; lower it."
-        )
-    return order, net
-
-
-def _pair(name: str, values: tuple[int, int]) -> tuple[int, int]:
+        return None
     try:
-        first, second = (operator.index(x) for x in values)
+        nu, nv = (operator.index(x) for x in net)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"{name} must be two whole numbers, but is {values!r}; give one for u and one for v."
+            f"net must be two whole numbers, but is {net!r}; give one for u and one for v."
         ) from error
-    return first, second
+    if nu < order[0] or nv < order[1]:
+        raise ValueError(
+            f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
+            f"is {nu} x {nv}; enlarge it or lower the order."
+        )
+    if nu * nv > LARGEST_NET:
+        raise ValueError(
+            f"net must have at most {LARGEST_NET} control points, but {nu} x {nv} are asked for; lower it."
+        )
+    return nu, nv

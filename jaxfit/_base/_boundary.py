@@ -100,8 +100,7 @@ class Boundary(eqx.Module):
 
 def diagonal(*sets: np.ndarray) -> float:
     """Bounding-box diagonal of all the points together."""
-    low, high = _box(sets)
-    return float(np.linalg.norm(high - low))
+    return float(np.linalg.norm(np.ptp(np.concatenate(sets).astype(float), axis=0)))
 
 
 def frame(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
@@ -119,12 +118,6 @@ def frame(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
 def farthest(centre: np.ndarray, *sets: np.ndarray) -> float:
     """Greatest distance of any of the points from the centre."""
     return max(float(np.linalg.norm(x - centre, axis=1).max()) for x in sets)
-
-
-def _box(sets: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-    low = np.min([np.min(x, axis=0) for x in sets], axis=0)
-    high = np.max([np.max(x, axis=0) for x in sets], axis=0)
-    return low.astype(float), high.astype(float)
 
 
 def _cleaned(lines: dict[str, np.ndarray], tolerance: Any) -> dict[str, np.ndarray]:
@@ -158,13 +151,13 @@ def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
     return kept
 
 
-def _gaps(lines: dict[str, np.ndarray]) -> list[float]:
+def _corner_gaps(lines: dict[str, np.ndarray]) -> list[float]:
     ends = [lines[v][v_end].astype(float) - lines[u][u_end].astype(float) for v, v_end, u, u_end in _CORNERS]
     return [float(np.linalg.norm(x)) for x in ends]
 
 
 def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) -> None:
-    gaps = _gaps(lines)
+    gaps = _corner_gaps(lines)
     worst = int(np.argmax(gaps))
     if gaps[worst] <= allowed:
         return
@@ -179,7 +172,7 @@ def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) ->
 def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
     for flips in sorted(product((1, -1), repeat=4), reverse=True):
         turned = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
-        if max(_gaps(turned)) <= allowed:
+        if max(_corner_gaps(turned)) <= allowed:
             names = [n for n, f in zip(lines, flips, strict=True) if f < 0]
             return f"reverse {' and '.join(names)}"
     return "make the polylines share their corner points"

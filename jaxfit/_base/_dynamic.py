@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxfit._base._base_method import AbstractBaseMethod
 from jaxfit._base._directed_projection import directed_projection, mean_distance, reach_of
 from jaxfit._base._grid_smoothing import smoothed
-from jaxfit._base._host_splines import Frame, Knots, applied, basis_matrix
+from jaxfit._base._host_splines import Frame, Knots, along_both, basis_matrix
 from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
 from jaxfit._splines._knots import greville
@@ -165,7 +165,7 @@ class _Level:
 
     def interpolated(self, displacements: np.ndarray) -> np.ndarray:
         """The Coons net plus the spline through the displacements, whose border is zero."""
-        extra = applied(self._lift[0], displacements, self._lift[1])
+        extra = along_both(self._lift[0], displacements, self._lift[1])
         extra[[0, -1]] = 0.0
         extra[:, [0, -1]] = 0.0
         return self.coons + extra

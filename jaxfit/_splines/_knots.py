@@ -93,10 +93,10 @@ def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]
                 "the one before it; sort them."
             )
     # By NumPy where it can be: every new length would compile anew.
-    return jnp.asarray(averaged(np.asarray(values) if is_concrete(values) else values, order))
+    return jnp.asarray(knots_by_averaging(np.asarray(values) if is_concrete(values) else values, order))
 
 
-def averaged(parameters: Any, order: int) -> Any:
+def knots_by_averaging(parameters: Any, order: int) -> Any:
     """`averaging_knots` of checked parameters, NumPy or JAX."""
     inside = _running_mean(parameters, order - 1)[: parameters.shape[0] - order]
     return _clamped(parameters[0], inside, parameters[-1], order)
