@@ -61,15 +61,10 @@ def fit_points(
             "four polylines around the patch."
         )
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
-    if not is_concrete(points, boundary):
-        raise TypeError(
-            "points and boundary must be concrete, but are traced; call base_surface outside jit, and inside "
-            "approximate(points, base), which may be traced and differentiated."
-        )
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     checked_request(cloud, method=method, **options)
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
-    if base is None:
+    if base is None and is_concrete(cloud):
         begun = default_base(boundary, np.asarray(cloud), net, order)
     else:
         begun = base_surface(boundary, cloud, net=net, order=order, method=base)
