@@ -22,11 +22,11 @@ def project(
     tolerance: Array,
     max_steps: Array,
     idle: Bool[Array, " points"] | None = None,
-    borders: bool = True,
+    borders: bool | Bool[Array, ""] = True,
     within: Border | None = None,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
+    they are. With `borders`, which may be traced, feet that do not converge are looked for on the four border curves (section 3.1
     of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
@@ -43,19 +43,22 @@ def project(
         feet = feet.standing(jnp.where(idle, ARRIVED, feet.state))
     if within is not None:
         return settle(method, pieces, target, feet, within, limits)
-    if not borders:
+    if borders is False:
         return settle(method, pieces, target, feet, _border(pieces, jnp.asarray(EVERYWHERE)), limits)
-    return _in_stages(method, pieces, target, feet, limits)
+    last = jnp.where(borders, AGAIN, EVERYWHERE)
+    return _in_stages(method, pieces, target, feet, limits, last)
 
 
-def _in_stages(method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits) -> Feet:
-    """Stages: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
+def _in_stages(
+    method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits, last: Array
+) -> Feet:
+    """Stages up to the `last`: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
     from the nearest of what was found, so that "converged" always means: with respect to the whole surface.
     """
 
     def unsettled(carry: tuple[Array, Feet]) -> Array:
         number, feet = carry
-        return (number <= AGAIN) & jnp.any(~feet.converged)
+        return (number <= last) & jnp.any(~feet.converged)
 
     def stage(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         number, old = carry
