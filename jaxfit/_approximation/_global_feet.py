@@ -25,13 +25,14 @@ def global_feet(
 ) -> Feet:
     """(u, v, distance, found) of the first `count` points; perhaps nearer than the `known` ones."""
     axes = (problem.axis_u, problem.axis_v) if growth is None else growth.axes
-    axes = tuple(jax.tree.map(np.asarray, axis) for axis in axes)
-    used = None if growth is None else tuple(int(axis.used) for axis in axes)
+    axis_u, axis_v = (jax.tree.map(np.asarray, axis) for axis in axes)
+    used = None if growth is None else (int(axis_u.used), int(axis_v.used))
     points = np.asarray(problem.target)[:, :count].T
     feet = nearest_feet(
         method.foot_method,
         np.asarray(net),
-        *axes,
+        axis_u,
+        axis_v,
         points,
         known=known,
         tolerance=float(problem.foot_tolerance),

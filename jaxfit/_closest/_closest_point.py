@@ -188,8 +188,9 @@ def _on_host(
     net, knots_u, knots_v = arrays
     orders = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
     axes = make_axis(knots_u, orders[0]), make_axis(knots_v, orders[1])
-    limits = {"tolerance": tolerance, "max_steps": max_steps}
-    best = nearest_feet(method, net, *axes, np.asarray(points), start=start, **limits)
+    best = nearest_feet(
+        method, net, *axes, np.asarray(points), start=start, tolerance=tolerance, max_steps=max_steps
+    )
     u, v, f, converged = (best[name] for name in ("u", "v", "f", "converged"))
     status = _status(axes[0].breaks, axes[1].breaks, u, v, converged, orders[1] == 1)
     with np.errstate(invalid="ignore"):

@@ -1,11 +1,10 @@
-"""Nearest feet of concrete points: padded to common sizes, and searched for globally where nothing is proven."""
+"""Nearest feet of concrete points: padded to common sizes, and searched for where nothing is proven."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
@@ -15,7 +14,7 @@ from jaxfit._cells import values_at
 from jaxfit._closest._candidates import Search
 from jaxfit._closest._project import project
 from jaxfit._closest._reach import Reach
-from jaxfit._closest._samples import Samples, sample
+from jaxfit._closest._samples import sample
 from jaxfit._closest._steps import AbstractFootMethod
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
@@ -146,10 +145,8 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
             search = Search(sample(net.astype(projector.dtype), *axes))
             take_nearer(best, left, projector(left, *search.nearest(points[left])))
         left = np.arange(len(points))
-    if (
-        len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells
-        and axes[1].polynomials.shape[1] > 1
-    ):
+    is_surface_in_space = net.shape[2] == 3 and axes[1].polynomials.shape[1] > 1
+    if is_surface_in_space and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
         proven = Reach(net, *axes).proves(best["u"], best["v"], np.sqrt(best["f"]))
         left = np.flatnonzero(~(proven & best["converged"]))
     if left.size:

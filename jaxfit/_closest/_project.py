@@ -26,8 +26,9 @@ def project(
     within: Border | None = None,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, which may be traced, feet that do not converge are looked for on the four border curves (section 3.1
-    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
+    they are. With `borders`, which may be traced, feet that do not converge are looked for on the four
+    border curves (section 3.1 of the paper). With `within`, bounds of every foot's own, feet are looked for
+    nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -52,8 +53,9 @@ def project(
 def _in_stages(
     method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits, last: Array
 ) -> Feet:
-    """Stages up to the `last`: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
-    from the nearest of what was found, so that "converged" always means: with respect to the whole surface.
+    """Stages up to the `last`: 0 everywhere; 1-4 one border each, for feet that have not converged; 5
+    everywhere again, from the nearest of what was found, so that "converged" always means: with respect to
+    the whole surface.
     """
 
     def unsettled(carry: tuple[Array, Feet]) -> Array:

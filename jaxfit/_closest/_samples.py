@@ -44,7 +44,7 @@ def sample(net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Sam
     """Sample every cell evenly, with bounds (concrete). Creases are sampled on both sides."""
     u, v, count_u, count_v = _parameters(net, axis_u, axis_v)
     cell_u, cell_v = axis_u.locate(u), axis_v.locate(v)
-    jet = grid_jet(net, (axis_u, axis_v), (u, v), (cell_u, cell_v), 2).transpose(1, 2, 0, 3, 4)
+    jet: Any = grid_jet(net, (axis_u, axis_v), (u, v), (cell_u, cell_v), 2).transpose(1, 2, 0, 3, 4)
     points = np.ascontiguousarray(jet[0, 0].transpose(0, 2, 1))
     neighbours = (_squared_gap(jet[0, 0], i, j) for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)))
     step_bound = 0.25 * STEP_SAFETY * reduce(np.maximum, neighbours)
@@ -52,8 +52,8 @@ def sample(net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Sam
     return Samples(u, v, points, step_bound, bent, axis_u.first[cell_u], axis_v.first[cell_v])
 
 
-def sample_points(net: Any, axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, Float[Numbers, "a b d"]]:
-    """Parameters u and v, and the points there."""
+def sample_points(net: Any, axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, Any]:
+    """Parameters u (a,) and v (b,), and the points there (a, b, d)."""
     u, v, _, _ = _parameters(net, axis_u, axis_v)
     jet = grid_jet(net, (axis_u, axis_v), (u, v), (axis_u.locate(u), axis_v.locate(v)), 0)
     return u, v, jet[:, 0, 0].swapaxes(1, 2)
