@@ -13,7 +13,7 @@ LARGEST_GAP = 2.0  # between the boxes, in diagonals of the larger one
 def check_same_place(points: Any, boundary: Boundary) -> None:
     """Raise ValueError if concrete points (N, d) and a boundary differ in place or unit.
 
-    Their bounding boxes may be two diagonals apart, of the larger one, and neither diagonal more than a hundred
+    Their boxes may be two diagonals apart, of the larger one, and neither diagonal more than a hundred
     times the other. A cloud that bulges far out of its boundary still meets its box.
     """
     lines = (boundary.v0, boundary.v1, boundary.u0, boundary.u1)
