@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
 from jaxfit._closest import _nearest_feet
+from jaxfit._splines._pieces import make_axis
 
 COUNT = 512  # one size for nearly all queries: few compilations
 
@@ -158,6 +159,22 @@ def test_a_long_thin_surface_and_coordinates_in_the_millions(wavy):
     moved = wavy.affine(np.diag([300.0, 300.0, 300.0]), np.array([5.1e5, 5.4e6, 100.0]))
     # Only nine digits are left below the diagonal; feet are as good as the coordinates are.
     assert_nearest(moved, queries(moved)[0])
+
+
+def test_known_feet_give_way_to_nearer_ones_and_the_rest_stays(wavy):
+    points, u, v = queries(wavy)
+    cold = closest_point(wavy, points)
+    axes = [make_axis(np.asarray(knots), 4) for knots in (wavy.knots_u, wavy.knots_v)]
+    u, v, distance = (np.array(x) for x in (cold.u, cold.v, cold.distance))
+    distance[::7] *= 1.5  # as if another part of the surface had been found
+    known = (u, v, distance, np.ones(COUNT, bool))
+    limits = {"tolerance": 1e-12, "max_steps": 60}
+    feet = _nearest_feet.nearest_feet(
+        Newton(), np.asarray(wavy.control_points), *axes, points, known=known, **limits
+    )
+    np.testing.assert_array_equal(feet["u"][1::7], u[1::7])
+    assert feet["converged"].all()
+    assert (np.sqrt(feet["f"]) <= distance * (1 + 1e-12)).all()
 
 
 def test_starts_near_the_feet_give_the_same_feet(wavy):
