@@ -16,7 +16,7 @@ from jaxfit._approximation._local_region import region_of
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Nesterov, at_rest
 from jaxfit._checks import check_kind, check_number, check_switches
-from jaxfit._closest import AbstractFootMethod, HuWallner, Newton, FootUpdate, update_feet
+from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._loop import AbstractIterativeMethod, Limits, Measured, Turn
 from jaxfit._fit._measure import border_on
 from jaxfit._splines._pieces import Pieces
@@ -196,7 +196,11 @@ class GeometricApproximation(AbstractIterativeMethod):
             # Weights follow from errors: those at converged feet, so these are looked at twice, or else
             # those of the iteration before.
             none = FootUpdate(u, v, measured.error, measured.steps, measured.found)
-            begin = (jnp.where(exact | (not self.foresees), 0, 1), none, jax.tree.map(jnp.zeros_like, measured.pulls))
+            begin = (
+                jnp.where(exact | (not self.foresees), 0, 1),
+                none,
+                jax.tree.map(jnp.zeros_like, measured.pulls),
+            )
 
             def look(carry: Any) -> Any:
                 number, feet, _ = carry

@@ -9,7 +9,7 @@ import numpy as np
 from jaxfit._splines._pieces import Numbers
 
 
-def overlap_add(terms: Sequence[Numbers], axis: int) -> Any:
+def overlap_add(terms: Sequence[Numbers] | Numbers, axis: int) -> Any:
     """The sum of the terms, each one place farther along `axis` than the one before.
 
     The result has len(terms) - 1 places more. An array counts as the sequence of its entries.

@@ -37,11 +37,13 @@ def evaluate_values(
 
 
 def _along_rows(coefficients: Array, s: Array, t: Array, partials: Sequence[tuple[int, int]]) -> list[Array]:
-    # Each derivative is a rule of its own, from the coefficients: that takes fewer steps of the processor than
+    # Each derivative is a rule of its own, from the coefficients: that takes less time than
     # rules that share intermediate results, which would have to be stored.
     rows, d, order_u, order_v = coefficients.shape
     flat = coefficients.reshape(rows, d, order_u * order_v).transpose(1, 0, 2)
-    return polynomial_partials(lax.split(flat, (1,) * (order_u * order_v), 2), order_v, s[None], t[None], partials)
+    return polynomial_partials(
+        lax.split(flat, (1,) * (order_u * order_v), 2), order_v, s[None], t[None], partials
+    )
 
 
 def polynomial_partials(

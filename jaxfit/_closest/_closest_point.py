@@ -19,9 +19,9 @@ from jaxfit._checks import (
     eager_where_concrete,
     is_concrete,
 )
+from jaxfit._closest._foot_methods import AbstractFootMethod, Newton
 from jaxfit._closest._implicit import foot_parameters
 from jaxfit._closest._on_host import feet_on_host
-from jaxfit._closest._foot_methods import AbstractFootMethod, Newton
 from jaxfit._precision import advise_x64, default_foot_tolerance
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import Border, project
 from jaxfit._closest._seeds import best_samples, sample
-from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import make_pieces
 

@@ -12,10 +12,10 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._cells import values_at
+from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
 from jaxfit._closest._rivals import Search
 from jaxfit._closest._seeds import Samples, sample
-from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 

@@ -23,7 +23,7 @@ def initial_feet(
     within: Border | None,
     done: int,
 ) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
-    """Feet at the nearest places to (u, v) in the domain, those `idle` in the state `done`; and their bounds."""
+    """Feet at the places in the domain nearest to (u, v), and their bounds; `idle` ones are `done`."""
     low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
     u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
     feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
@@ -110,6 +110,6 @@ def _merge(old: Feet, new: Feet, number: Array, limits: Limits) -> Feet:
     nearer = new.best < old.best - limits.slack(old.best)
     nearer = jnp.where(jnp.isinf(old.best), jnp.isfinite(new.best), nearer)
     whole = (number == EVERYWHERE) | (number == AGAIN)
-    state = jnp.where(new.converged & whole, FOUND, GIVEN_UP)
-    spent = Feet(old.real, new.whole).with_state(jnp.full_like(state, GIVEN_UP))
+    state = jnp.where(new.converged & whole, float(FOUND), float(GIVEN_UP)).astype(new.parts.dtype)
+    spent = Feet(jnp.concatenate([old.parts[:5], new.parts[5:]])).with_state(jnp.full_like(state, GIVEN_UP))
     return keep(old.converged, old, keep(nearer | whole, new.with_state(state), spent))

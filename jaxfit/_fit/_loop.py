@@ -215,7 +215,9 @@ def begin(
     if method.counts:
         counts, sizes = xp.zeros(empty.shape, np.int32), xp.zeros((2, *empty.shape), np.int32)
         nothing = number(0)
-    pulls = WeightedErrors(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
+    pulls = (
+        WeightedErrors(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)) if method.gathers else None
+    )
     poor = none > 0 if method.marks else None
     shift = xp.zeros((), net.dtype) if method.solves else None
     ahead = None
