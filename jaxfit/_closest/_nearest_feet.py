@@ -22,7 +22,7 @@ from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 CHUNK = 1 << 16
 FEW = 1 << 13  # points at a time where most feet are known
 # The reach costs about as much as the search for so many points a cell.
-LEAST_POINTS_PER_CELL = 0.5
+LEAST_POINTS_PER_CELL = 24
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
 
 
