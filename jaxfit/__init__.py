@@ -4,6 +4,7 @@ __version__ = "0.1.0"
 
 from jaxfit import _interrupt as _interrupt  # first, for it acts on the other imports
 from jaxfit._approximation import AtParameters as AtParameters
+from jaxfit._approximation import ControlPointSums as ControlPointSums
 from jaxfit._approximation import Discrepancy as Discrepancy
 from jaxfit._approximation import Fairing as Fairing
 from jaxfit._approximation import GaussNewton as GaussNewton
@@ -37,6 +38,7 @@ from jaxfit._closest import HuWallner as HuWallner
 from jaxfit._closest import Newton as Newton
 from jaxfit._closest import PointStatus as PointStatus
 from jaxfit._closest import closest_point as closest_point
+from jaxfit._closest import update_feet as update_feet
 from jaxfit._fit import RESULTS as RESULTS
 from jaxfit._fit import AbstractIterativeMethod as AbstractIterativeMethod
 from jaxfit._fit import ErrorHistory as ErrorHistory
@@ -50,6 +52,7 @@ from jaxfit._fit import Iterate as Iterate
 from jaxfit._fit import Problem as Problem
 from jaxfit._fit import Projection as Projection
 from jaxfit._fit import WorkingSurface as WorkingSurface
+from jaxfit._fit import held_points as held_points
 from jaxfit._interpolation import Chebyshev as Chebyshev
 from jaxfit._interpolation import ConstantWeight as ConstantWeight
 from jaxfit._interpolation import GeometricInterpolation as GeometricInterpolation

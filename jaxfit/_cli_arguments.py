@@ -8,6 +8,7 @@ from typing import NoReturn
 from jaxfit import __version__
 from jaxfit.io import InputError
 
+_MOST_STEPS = 1_000_000  # of which the errors are kept
 _DESCRIPTION = """\
 Fit a B-spline surface to INPUT and write it to OUTPUT.
 
@@ -103,6 +104,8 @@ def _percent(text: str) -> float:
 
 
 def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
+    if not re.fullmatch(r"\d*[1-9]\d*", text, re.ASCII):
         raise argparse.ArgumentTypeError(f"{text!r} is no number of steps such as 100")
+    if len(text) > len(str(_MOST_STEPS)) or int(text) > _MOST_STEPS:
+        raise argparse.ArgumentTypeError(f"{text:.12} is too large, pass at most {_MOST_STEPS:,}")
     return int(text)

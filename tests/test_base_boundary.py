@@ -99,3 +99,16 @@ def test_a_boundary_goes_through_jit_and_is_built_inside():
     sides = {name: jax.numpy.asarray(x) for name, x in square().items()}
     boundary = jax.jit(lambda **kw: Boundary(**kw))(**sides)
     np.testing.assert_array_equal(jax.jit(lambda b: 2 * b.v1)(boundary), 2 * sides["v1"])
+
+
+@pytest.mark.parametrize("tolerance", [-1, float("nan"), float("inf"), True])
+def test_a_tolerance_that_is_no_distance_is_refused(tolerance):
+    with pytest.raises((TypeError, ValueError), match="tolerance must be"):
+        Boundary(**square(), tolerance=tolerance)
+
+
+def test_masked_polylines_are_refused():
+    sides = square()
+    sides["v1"] = np.ma.masked_greater(sides["v1"], 0.9)
+    with pytest.raises(ValueError, match="v1 must not be masked"):
+        Boundary(**sides)

@@ -6,7 +6,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from jaxfit._base._curve_fit import CurveStart, fit_curves
-from jaxfit._base._opposite import starts_by_count, starts_by_tolerance
+from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
 from jaxfit._splines import BSplineCurve, averaging_knots
 
 ORDER = 4

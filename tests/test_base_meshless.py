@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import jaxfit as jf
-from jaxfit._base._stars import mean_value_weights, stars
+from jaxfit._base._delaunay_stars import mean_value_weights, stars
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 NET = (10, 9)

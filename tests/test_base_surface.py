@@ -8,6 +8,7 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.spatial import cKDTree
 
+import jaxfit as jf
 from jaxfit._base import Boundary, base_surface
 
 SIDES = ("v0", "v1", "u0", "u1")
@@ -151,8 +152,8 @@ def test_a_second_boundary_compiles_nothing():
     [
         ({"net": (3, 9)}, "net must be at least 4 x 4"),
         ({"net": (9, 4), "order": (4, 5)}, "net must be at least 4 x 5"),
-        ({"order": (1, 4)}, "order must be 2 to 8"),
-        ({"order": (4, 9)}, "order must be 2 to 8"),
+        ({"order": (1, 4)}, "order must be a pair"),
+        ({"order": (4, 9)}, "order must be a pair"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
         ({"points": np.ones((5, 2))}, "points must have 3 coordinates"),
     ],
@@ -165,6 +166,22 @@ def test_impossible_requests_are_refused(arguments, sentence):
 def test_inside_jit_it_says_so():
     with pytest.raises(TypeError, match="outside jit"):
         jax.jit(base_surface)(wavy_boundary())
+
+
+@pytest.mark.parametrize("method", [None, jf.Coons(), jf.Meshless()])
+def test_traced_points_are_refused_with_what_is_possible(method):
+    boundary, points = wavy_boundary(), np.random.default_rng(0).random((80, 3))
+    with pytest.raises(TypeError, match=r"points must be concrete.*approximate\(points, base\)"):
+        jax.jit(lambda x: base_surface(boundary, x, method=method))(points)
+    with pytest.raises(TypeError, match=r"must be concrete.*approximate\(points, base\)"):
+        jax.grad(lambda x: jf.fit_points(x, boundary, base=method).average_error)(points)
+
+
+def test_nets_not_asked_for_follow_one_rule():
+    boundary = Boundary.from_grid(helpers.wavy_grid(9, 9) * [4.0, 1.0, 1.0])
+    points = np.random.default_rng(0).random((800, 3)) * [4.0, 1.0, 0.0]
+    assert base_surface(boundary, points, method=jf.Meshless()).shape == (20, 8)
+    assert jf.fit_points(points, boundary, max_steps=0, throw=False).surface.shape == (20, 8)
 
 
 def real_boundary(name):

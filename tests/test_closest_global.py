@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
-from jaxfit._closest import _on_host
+from jaxfit._closest import _nearest_feet
 
 COUNT = 512  # one size for nearly all queries: few compilations
 
@@ -78,7 +78,7 @@ def test_a_cloud_in_chunks_has_the_feet_of_the_whole(wavy, monkeypatch):
     points, u, v = queries(wavy)
     start = (np.clip(u + 0.01, 0, 1), np.clip(v - 0.01, 0, 1))
     whole, warm = closest_point(wavy, points), closest_point(wavy, points, start)
-    monkeypatch.setattr(_on_host, "CHUNK", COUNT // 2 - 50)  # three parts, the last one shorter
+    monkeypatch.setattr(_nearest_feet, "CHUNK", COUNT // 2 - 50)  # three parts, the last one shorter
     for feet, expected in ((closest_point(wavy, points), whole), (closest_point(wavy, points, start), warm)):
         assert feet.converged.all()
         np.testing.assert_allclose(feet.distance, expected.distance, rtol=0, atol=1e-12)

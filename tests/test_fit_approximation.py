@@ -342,7 +342,7 @@ def test_bad_input_gets_a_sentence(base, change, sentence):
 
 
 def test_what_a_fit_cannot_do_is_said_before_there_is_a_base_surface(monkeypatch):
-    monkeypatch.setattr("jaxfit._approximation._fit_points.chosen_base", None)
+    monkeypatch.setattr("jaxfit._approximation._fit_points.default_base", None)
     for change, sentence in (
         ({"points": np.ones((9, 3))}, "must not all coincide"),
         ({"points": POINTS[:, :2]}, "points must have 3 coordinates"),

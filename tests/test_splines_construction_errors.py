@@ -107,3 +107,9 @@ def test_pytree_operations_need_no_valid_surface():
     np.testing.assert_allclose(moved(0.3, 0.4), surface(0.3, 0.4) + 1)
     shapes = eqx.filter_eval_shape(lambda: BSplineSurface(NET, KU, KV))
     assert shapes.control_points.shape == NET.shape
+
+
+def test_masked_control_points_are_refused():
+    net = np.ma.masked_greater(np.random.default_rng(0).random((4, 4, 3)), 0.9)
+    with pytest.raises(ValueError, match="control_points must not be masked"):
+        BSplineSurface(net, *[np.repeat([0.0, 1.0], 4)] * 2)

@@ -5,6 +5,7 @@ from jaxfit._approximation._automatic_smoothing import Discrepancy as Discrepanc
 from jaxfit._approximation._automatic_smoothing import (
     GeneralizedCrossValidation as GeneralizedCrossValidation,
 )
+from jaxfit._approximation._control_point_sums import ControlPointSums as ControlPointSums
 from jaxfit._approximation._errors import AtParameters as AtParameters
 from jaxfit._approximation._errors import GlobalFeet as GlobalFeet
 from jaxfit._approximation._errors import LocalFeet as LocalFeet

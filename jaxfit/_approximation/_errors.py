@@ -6,8 +6,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxfit._closest import closest_point
+from jaxfit._checks import is_concrete
+from jaxfit._closest import Newton, closest_point, nearest_feet
+from jaxfit._precision import default_foot_tolerance
 from jaxfit._splines import BSplineSurface
+from jaxfit._splines._pieces import make_axis
+
+MAX_STEPS = 60  # evaluations of a foot in the global search
 
 Feet = tuple[Any, Any, Any, Any]  # u, v, distance in the user's unit, converged
 
@@ -74,14 +79,16 @@ class GlobalFeet(AbstractErrors):
 
     def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
         """The nearest of all."""
-        found = closest_point(surface, points)
-        parts = (found.u, found.v, found.distance, found.converged)
+        if not is_concrete(surface, points, known):
+            found = closest_point(surface, points)
+            return found.u, found.v, found.distance, found.converged
         if not at_feet:
-            return parts
-        u, v, distance, converged = (np.array(np.asarray(x)) for x in known)
-        other = [np.asarray(x) for x in parts]
-        # A foot that has not converged is still on the surface: the distance is no less for that.
-        nearer = other[3] & (other[2] <= distance * np.where(converged, 1 - 1e-6, 1.0))
-        for mine, theirs in zip((u, v, distance, converged), other, strict=True):
-            mine[nearer] = theirs[nearer]
-        return u, v, distance, converged
+            known = LocalFeet().feet(surface, points, known, at_feet)
+        knots = [np.asarray(x) for x in (surface.knots_u, surface.knots_v)]
+        axes = (make_axis(x, order) for x, order in zip(knots, surface.order, strict=True))
+        net = np.asarray(surface.control_points)
+        tolerance = default_foot_tolerance(net.dtype)
+        found = nearest_feet(
+            Newton(), net, *axes, np.asarray(points), known=known, tolerance=tolerance, max_steps=MAX_STEPS
+        )
+        return found["u"], found["v"], np.sqrt(found["f"]), found["converged"]

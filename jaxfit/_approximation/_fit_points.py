@@ -8,13 +8,10 @@ from jax.typing import ArrayLike
 
 from jaxfit._approximation._approximate import LEAST_POINTS, approximate
 from jaxfit._approximation._checked_arguments import checked_request
-from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, chosen_base
+from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
-
-POINTS_PER_CONTROL_POINT = 8  # of a net chosen here
-MOST_CONTROL_POINTS = 64  # per direction, likewise
 
 
 @eager_where_concrete
@@ -54,7 +51,7 @@ def fit_points(
     ValueError
         As `base_surface` and `approximate` do, and if there is no boundary.
     TypeError
-        If there is no such option.
+        If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
     """
     _check_names(options)
     check_order(order)
@@ -66,9 +63,9 @@ def fit_points(
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     checked_request(cloud, method=method, **options)
-    net = _default_net(cloud.shape[0], boundary, order) if net is None else net
+    net = default_net(cloud.shape[0], boundary, order) if net is None else net
     if base is None and is_concrete(cloud):
-        begun = chosen_base(boundary, np.asarray(cloud), net, order)
+        begun = default_base(boundary, np.asarray(cloud), net, order)
     else:
         begun = base_surface(boundary, cloud, net=net, order=order, method=base)
     return approximate(cloud, begun, method, **options)
@@ -79,13 +76,3 @@ def _check_names(options: dict[str, Any]) -> None:
     for name in options:
         if name not in known:
             raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(known)}.")
-
-
-def _default_net(count: int, boundary: Boundary, order: tuple[int, int]) -> tuple[int, int]:
-    sides = (boundary.v0, boundary.v1, boundary.u0, boundary.u1)
-    lengths = [np.linalg.norm(np.diff(np.asarray(x), axis=0), axis=1).sum() for x in sides]
-    ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
-    root = np.sqrt(max(count / POINTS_PER_CONTROL_POINT, 1.0))
-    wanted = (round(root * ratio), round(root / ratio))
-    nu, nv = (int(np.clip(n, 2 * k, MOST_CONTROL_POINTS)) for n, k in zip(wanted, order, strict=True))
-    return nu, nv

@@ -20,7 +20,7 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 def gauss_newton_step(
     axes: tuple[Axis, Axis],
     smoothing: Any,
-    reach: float,
+    reach: Any,
     correction_rhs: Callable[[Array, Array], Array],
     equations: NormalEquations,
     net: Float[Array, "nu nv d"],

@@ -164,11 +164,10 @@ class GeometricApproximation(AbstractIterativeMethod):
         state: GeometricState = iterate.state
         pieces, before = iterate.surface.pieces, iterate.projection
         resting = ~jnp.asarray(problem.real)
-        touched = None
         if self.local:
             assert state.exceeded is not None
             region = region_of(pieces, before.u, before.v, state.exceeded)
-            resting, touched = resting | (~region.alive & ~exact), region.touched
+            resting = resting | (~region.alive & ~exact)
         feet, sums = self._feet(problem, pieces, state, before, resting, exact)
         error = jnp.where(resting, before.error, feet.error)
         extrapolation = state.extrapolation
@@ -182,7 +181,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             exceeded = exceeded | (errors > _threshold(problem, jnp.max(errors)))
             # Sums are complete where all points were looked at, or those that feel what was touched before.
             after = region_of(pieces, feet.u, feet.v, exceeded)
-            complete = jnp.where(exact, after.touched, touched)
+            complete = jnp.where(exact, after.touched, region.touched)
             sums = jnp.where(complete[..., None], sums, 0.0)
         certain = exact | (not self.foresee)
         converged = jnp.where(certain, feet.converged, before.converged)

@@ -5,23 +5,22 @@ import operator
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfit._base._base_method import AbstractBaseMethod, Coons
 from jaxfit._base._boundary import Boundary, farthest, frame
-from jaxfit._base._boundary_check import check_same_place
-from jaxfit._base._cloud import Cloud, cloud_of
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
-from jaxfit._base._douglas_peucker import chord_lengths
-from jaxfit._base._method import AbstractBaseMethod, Coons, refined
-from jaxfit._base._opposite import starts_by_count, starts_by_tolerance
-from jaxfit._checks import as_points, check_kind, eager_where_concrete, is_concrete
+from jaxfit._base._default_net import default_net
+from jaxfit._base._host_splines import halve_widest_spans
+from jaxfit._base._normalised_cloud import cloud_of
+from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
+from jaxfit._base._same_place import check_same_place
+from jaxfit._checks import as_points, check_kind, check_number, check_order, eager_where_concrete, is_concrete
 from jaxfit._splines import BSplineSurface
 
 MAX_STEPS = 100  # of the curve fit; few curves use them up
 CLOSE = 0.01  # the curve fit stops when its average error is this much of the tolerance
 FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are split in the middle
 
-POINTS_PER_CONTROL_POINT = 8  # of a net chosen here for a method that looks at the cloud
-MOST_CONTROL_POINTS = 64  # per direction, likewise
 LARGEST_NET = 10_000_000  # control points in all: a fit of more would not fit in memory
 
 
@@ -89,16 +88,23 @@ def base_surface(
     (two if K and L differ), padded so that boundaries of similar size share it.
 
     Sources: paper sections 2.3 and 4.1, equations (5)-(7), Algorithm 1 for curves.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5), indexing="ij")
+    >>> surface = jf.base_surface(jf.Boundary.from_grid(np.stack([x, y, x * y], axis=2)), net=(4, 4))
+    >>> surface.shape, surface.order, surface(1.0, 1.0).tolist()
+    ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
-    order, net = _checked(boundary, net, order, tolerance)
+    net = _checked_net(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     sides = [np.asarray(x) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
     dtype, dimension = sides[0].dtype, sides[0].shape[1]
+    _check_cloud(method, points, dimension)
     clouds = [] if points is None else [np.asarray(as_points("points", points, dimension))]
-    _check_cloud(method, clouds, points)
-    for cloud in clouds:
-        check_same_place(cloud, boundary)
+    for each in clouds:
+        check_same_place(each, boundary)
     # Centred and of size one, so that neither units nor coordinates in the millions matter.
     centre, size = frame(sides)
     lines = [(x.astype(float) - centre) / size for x in sides]
@@ -108,45 +114,33 @@ def base_surface(
     blend = coons_net(
         controls, knots[0], knots[2], method.abscissae if isinstance(method, Coons) else abscissae
     )
-    placed, pair = np.asarray(blend, float), (knots[0], knots[2])
+    placed, pair = np.asarray(blend, float), (knots[0].astype(float), knots[2].astype(float))
     if isinstance(method, AbstractBaseMethod):
-        placed, pair = _filled(method, placed, pair, order, net is None, cloud_of(clouds[0], boundary))
+        cloud = cloud_of(clouds[0], boundary)
+        if net is None:
+            placed, pair = halve_widest_spans(
+                placed, pair, order, default_net(len(cloud.points), boundary, order)
+            )
+        placed = method.fill(placed, pair, order, cloud)
     placed = (placed * size + centre).astype(dtype)
     for j, side in ((0, sides[0]), (-1, sides[1])):  # the corners to the last bit
         placed[0, j], placed[-1, j] = side[0], side[-1]
     return BSplineSurface(placed, *(x.astype(dtype) for x in pair))
 
 
-def _filled(
-    method: AbstractBaseMethod,
-    net: np.ndarray,
-    knots: tuple[np.ndarray, np.ndarray],
-    order: tuple[int, int],
-    grows: bool,
-    cloud: Cloud,
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """The net, refined if it `grows`, with its inside at the cloud; and its knots."""
-    pair = [x.astype(float) for x in knots]
-    if grows:
-        lengths = [chord_lengths(x)[-1] for x in cloud.sides]
-        ratio = np.sqrt((lengths[0] + lengths[1]) / (lengths[2] + lengths[3]))
-        root = np.sqrt(len(cloud.points) / POINTS_PER_CONTROL_POINT)
-        for axis, wanted in enumerate((root * ratio, root / ratio)):
-            most = min(round(wanted), MOST_CONTROL_POINTS)
-            net, pair[axis] = refined(net, pair[axis], order[axis], axis, most)
-    return method.fill(net, (pair[0], pair[1]), order, cloud), (pair[0], pair[1])
-
-
-def _check_cloud(method: Coons | AbstractBaseMethod | None, clouds: list, points: ArrayLike | None) -> None:
+def _check_cloud(method: Coons | AbstractBaseMethod | None, points: ArrayLike | None, dimension: int) -> None:
+    if not is_concrete(points):
+        raise TypeError(
+            "points must be concrete, but are traced; call base_surface outside jit. What may be traced and "
+            "differentiated are coons_surface and approximate(points, base)."
+        )
     if not isinstance(method, AbstractBaseMethod):
         return
-    if not clouds:
+    if points is None:
         raise ValueError(
             f"points must be given for {type(method).__name__}(), but is None; pass the cloud or use Coons()."
         )
-    if not is_concrete(points):
-        raise TypeError("points must be concrete, but are traced; call base_surface outside jit.")
-    method.check_dimension(clouds[0].shape[1])
+    method.check_dimension(dimension)
 
 
 def _curves(
@@ -173,45 +167,41 @@ def _curves(
     ]
 
 
-def _checked(
+def _checked_net(
     boundary: Boundary,
     net: tuple[int, int] | None,
     order: tuple[int, int],
     tolerance: float,
-) -> tuple[tuple[int, int], tuple[int, int] | None]:
+) -> tuple[int, int] | None:
     if not isinstance(boundary, Boundary):
         raise TypeError(
             f"boundary must be a Boundary, but is a {type(boundary).__name__}; build one with "
             "Boundary(v0, v1, u0, u1) or Boundary.from_grid(grid)."
         )
     if not is_concrete(boundary):
-        raise TypeError("boundary must be concrete, but is traced; call base_surface outside jit.")
+        raise TypeError(
+            "boundary must be concrete, but is traced; call base_surface outside jit, or blend its curves by "
+            "coons_surface, which may be traced and differentiated."
+        )
+    check_number("tolerance", tolerance, 0.0)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")
-    order = _pair("order", order)
-    if not all(2 <= each <= 8 for each in order):
-        raise ValueError(f"order must be 2 to 8 in each direction, but is {order}; change it.")
+    check_order(order)
     if net is None:
-        return order, None
-    net = _pair("net", net)
-    if net[0] < order[0] or net[1] < order[1]:
-        raise ValueError(
-            f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
-            f"is {net[0]} x {net[1]}; enlarge it or lower the order."
-        )
-    if net[0] * net[1] > LARGEST_NET:
-        raise ValueError(
-            f"net must have at most {LARGEST_NET} control points, but {net[0]} x {net[1]} are asked "
-            "for; lower it."
-        )
-    return order, net
-
-
-def _pair(name: str, values: tuple[int, int]) -> tuple[int, int]:
+        return None
     try:
-        first, second = (operator.index(x) for x in values)
+        nu, nv = (operator.index(x) for x in net)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"{name} must be two whole numbers, but is {values!r}; give one for u and one for v."
+            f"net must be two whole numbers, but is {net!r}; give one for u and one for v."
         ) from error
-    return first, second
+    if nu < order[0] or nv < order[1]:
+        raise ValueError(
+            f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
+            f"is {nu} x {nv}; enlarge it or lower the order."
+        )
+    if nu * nv > LARGEST_NET:
+        raise ValueError(
+            f"net must have at most {LARGEST_NET} control points, but {nu} x {nv} are asked for; lower it."
+        )
+    return nu, nv

@@ -1,6 +1,7 @@
 """The four boundary polylines of a patch, checked and with common corners."""
 
 from itertools import product
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._checks import as_floating, as_points, check_number, is_concrete
 
 # The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
 _CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
@@ -23,18 +24,38 @@ class Boundary(eqx.Module):
          |                |
         c00 ---- v0 ---> c10
 
-    `v0` and `v1` are the sides v = 0 and v = 1, along which u grows; `u0` and `u1` the sides
-    u = 0 and u = 1, along which v grows.
+    `v0` and `v1` are the sides v = 0 and v = 1, along which u grows; `u0` and `u1` are the sides
+    u = 0 and u = 1, along which v grows. A polyline may be closed: opposite corners then coincide,
+    as on a tube.
 
-    Parameters: each polyline (n_i, d) with n_i >= 2 vertices and a common d, any unit, vertices in
-    order. Ends that should meet may differ by `tolerance` (default 1e-6) times the bounding-box
-    diagonal: the u-polyline's end is then moved onto the v-polyline's. Consecutive duplicates
-    are dropped.
+    Parameters
+    ----------
+    v0, v1, u0, u1 : arrays (n_i, d)
+        At least two vertices each, in order, in any unit. Consecutive duplicates are dropped.
+    tolerance : float
+        How far ends that should meet may be apart, as a fraction of the bounding-box diagonal
+        (default 1e-6, at least 0). The end of the u-polyline moves onto that of the v-polyline.
 
-    Raises ValueError, naming the polyline, for too few vertices, NaNs, different d, a polyline of
-    length zero (patches with three sides are not supported) and corners that do not meet. A
-    polyline may be closed: opposite corners then coincide, as on a tube. Inside `jit` only
-    shapes are checked and the vertices are taken as they are.
+    Raises
+    ------
+    ValueError
+        For too few vertices, numbers that are not finite, masked entries, different d, a polyline of
+        length zero (patches with three sides are not supported), corners that do not meet, or a
+        tolerance that is negative or not finite. Inside `jit` only shapes are checked, and the
+        vertices are taken as they are.
+    TypeError
+        If the tolerance is no number, or the polylines are not real.
+
+    Examples
+    --------
+    >>> boundary = jf.Boundary(
+    ...     v0=np.array([[0.0, 0.0], [1.0, 0.0]]),
+    ...     v1=np.array([[0.0, 2.0], [1.0, 2.0]]),
+    ...     u0=np.array([[0.0, 0.0], [0.0, 1.0], [0.0, 2.0]]),
+    ...     u1=np.array([[1.0, 0.0], [1.0, 2.0]]),
+    ... )
+    >>> boundary.u0.shape
+    (3, 2)
     """
 
     v0: Float[Array, "v0_points d"]
@@ -48,8 +69,9 @@ class Boundary(eqx.Module):
         v1: ArrayLike,
         u0: ArrayLike,
         u1: ArrayLike,
-        tolerance: float = 1e-6,
+        tolerance: ArrayLike = 1e-6,
     ):
+        check_number("tolerance", tolerance, 0.0)
         given = {"v0": v0, "v1": v1, "u0": u0, "u1": u1}
         lines = {name: as_points(name, x, least=2) for name, x in given.items()}
         for name, line in lines.items():
@@ -78,8 +100,7 @@ class Boundary(eqx.Module):
 
 def diagonal(*sets: np.ndarray) -> float:
     """Bounding-box diagonal of all the points together."""
-    low, high = _box(sets)
-    return float(np.linalg.norm(high - low))
+    return float(np.linalg.norm(np.ptp(np.concatenate(sets).astype(float), axis=0)))
 
 
 def frame(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
@@ -99,13 +120,7 @@ def farthest(centre: np.ndarray, *sets: np.ndarray) -> float:
     return max(float(np.linalg.norm(x - centre, axis=1).max()) for x in sets)
 
 
-def _box(sets: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray]:
-    low = np.min([np.min(x, axis=0) for x in sets], axis=0)
-    high = np.max([np.max(x, axis=0) for x in sets], axis=0)
-    return low.astype(float), high.astype(float)
-
-
-def _cleaned(lines: dict[str, np.ndarray], tolerance: float) -> dict[str, np.ndarray]:
+def _cleaned(lines: dict[str, np.ndarray], tolerance: Any) -> dict[str, np.ndarray]:
     magnitude = max(float(np.abs(x).max()) for x in lines.values())
     eps = float(jnp.finfo(lines["v0"].dtype).eps)
     rounding, size = 4 * eps * magnitude, diagonal(*lines.values())
@@ -136,13 +151,13 @@ def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
     return kept
 
 
-def _gaps(lines: dict[str, np.ndarray]) -> list[float]:
+def _corner_gaps(lines: dict[str, np.ndarray]) -> list[float]:
     ends = [lines[v][v_end].astype(float) - lines[u][u_end].astype(float) for v, v_end, u, u_end in _CORNERS]
     return [float(np.linalg.norm(x)) for x in ends]
 
 
 def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) -> None:
-    gaps = _gaps(lines)
+    gaps = _corner_gaps(lines)
     worst = int(np.argmax(gaps))
     if gaps[worst] <= allowed:
         return
@@ -157,7 +172,7 @@ def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) ->
 def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
     for flips in sorted(product((1, -1), repeat=4), reverse=True):
         turned = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
-        if max(_gaps(turned)) <= allowed:
+        if max(_corner_gaps(turned)) <= allowed:
             names = [n for n, f in zip(lines, flips, strict=True) if f < 0]
             return f"reverse {' and '.join(names)}"
     return "make the polylines share their corner points"

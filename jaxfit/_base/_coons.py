@@ -21,7 +21,15 @@ class AbstractAbscissae(eqx.Module):
 
 
 class Greville(AbstractAbscissae):
-    """Greville abscissae: the blend of four straight sides is their bilinear patch, always."""
+    r"""Greville abscissae: the blend of four straight sides is their bilinear patch, always.
+
+    $s_i = (t_{i+1} + \dots + t_{i+K-1}) / (K - 1)$, mapped to [0, 1]. The default of `coons_surface`.
+
+    Examples
+    --------
+    >>> print(np.round(jf.Greville()(jf.clamped_uniform_knots(5, 4), 4), 3))
+    [0.    0.167 0.5   0.833 1.   ]
+    """
 
     def __call__(self, knots: Float[Array, " knots"], order: int) -> Float[Array, " n"]:
         """Means of order - 1 consecutive knots, mapped to [0, 1]."""
@@ -30,7 +38,15 @@ class Greville(AbstractAbscissae):
 
 
 class Uniform(AbstractAbscissae):
-    """The paper's i/n: equal steps, whatever the knots; right for uniform knots far inside."""
+    """Equal steps i/n, whatever the knots, as in equations (6)-(7) of the paper.
+
+    Exact only far inside of uniform knots; elsewhere `Greville` is.
+
+    Examples
+    --------
+    >>> print(np.round(jf.Uniform()(jf.clamped_uniform_knots(5, 4), 4), 3))
+    [0.   0.25 0.5  0.75 1.  ]
+    """
 
     def __call__(self, knots: Float[Array, " knots"], order: int) -> Float[Array, " n"]:
         """Equal steps."""
@@ -49,22 +65,38 @@ def coons_surface(
 ) -> BSplineSurface:
     r"""The Coons surface of four B-spline curves, opposite ones on equal knots.
 
-    The control points of the curves are blended (equations (6)-(7)); with abscissae
+    The control points of the curves are blended (paper, equations (6)-(7)). With abscissae
     $s_i, t_j$ and corner points $P_{00}, P_{n0}, P_{0m}, P_{nm}$
 
     .. math:: P_{ij} = (1-s_i) P_{0j} + s_i P_{nj} + (1-t_j) P_{i0} + t_j P_{im}
               - [(1-s_i)(1-t_j) P_{00} + (1-s_i) t_j P_{0m} + s_i (1-t_j) P_{n0} + s_i t_j P_{nm}].
 
-    `v0` and `v1` run along u at v = 0 and v = 1, `u0` and `u1` along v at u = 0 and u = 1 (as in
-    `Boundary`). The surface has the four curves as its sides where they share their corners;
-    where they do not quite, `v0` and `v1` win. Jit, vmap and grad work.
+    The surface has the four curves as its sides where they share their corners; where they do not
+    quite, `v0` and `v1` win. Works under `jit`, `vmap` and `grad`.
 
-    `abscissae`: `Greville()` (default), with which curves whose control points lie at their
-    Greville abscissae on four straight sides give the bilinear patch itself; or `Uniform()`,
-    the paper's i/n.
+    Parameters
+    ----------
+    v0, v1 : BSplineCurve
+        Along u, at v = 0 and v = 1; n control points in d dimensions, on equal knots.
+    u0, u1 : BSplineCurve
+        Along v, at u = 0 and u = 1; m control points.
+    abscissae : Greville() or Uniform()
+        Where control points are taken to sit: at their Greville abscissae (default), so that four
+        straight sides give the bilinear patch itself, or at the paper's i/n.
 
-    Raises ValueError where two opposite curves have different knots (values are compared only
-    outside `jit`).
+    Raises
+    ------
+    ValueError
+        If two opposite curves have different knots. Values are compared only outside `jit`.
+
+    Examples
+    --------
+    >>> def line(a, b):
+    ...     return jf.BSplineCurve(np.array([a, b]), np.array([0.0, 0, 1, 1]))
+    >>> o, x, y, z = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 1.0]
+    >>> surface = jf.coons_surface(line(o, x), line(y, z), line(o, y), line(x, z))
+    >>> surface(0.5, 0.5).tolist()
+    [0.5, 0.5, 0.25]
     """
     for (name_a, a), (name_b, b) in ((("v0", v0), ("v1", v1)), (("u0", u0), ("u1", u1))):
         same = a.knots.shape == b.knots.shape and a.order == b.order

@@ -126,7 +126,7 @@ def _step(problem: _Problem, state: _State, tolerance: Array, order: int) -> _St
     sums = sums.at[foot.touched].add(terms)
     den = sums[:, -1:]
     moves = sums[:, :-1] / jnp.where(den > 0, den, 1)  # zero where no point touches
-    average = jnp.sum(problem.weights * _norm(foot.errors)) / jnp.sum(problem.weights)
+    average = jnp.sum(problem.weights * _lengths(foot.errors)) / jnp.sum(problem.weights)
     look = (state.step % CHECK_EVERY) == CHECK_EVERY - 1
     return _State(
         state.control + problem.free * moves,
@@ -152,7 +152,7 @@ def _projected(problem: _Problem, control: Array, feet: Array, order: int) -> _F
     reach = (stop - start) / 16
     moved = jnp.clip(feet + jnp.clip(step, -reach, reach), start, stop)
     there, _ = _located(problem, control, moved, order, ())
-    closer = _norm(there.errors) < _norm(here.errors)
+    closer = _lengths(there.errors) < _lengths(here.errors)
 
     def choose(x: Array, y: Array) -> Array:
         return jnp.where(closer.reshape(-1, *[1] * (x.ndim - 1)), x, y)
@@ -171,5 +171,5 @@ def _located(
     return _Feet(u, touched, basis[0], problem.points - values[0]), values[1:]
 
 
-def _norm(x: Array) -> Array:
+def _lengths(x: Array) -> Array:
     return jnp.sqrt(jnp.sum(x * x, axis=-1))

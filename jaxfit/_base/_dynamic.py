@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._cloud import Cloud, thinned
+from jaxfit._base._base_method import AbstractBaseMethod
+from jaxfit._base._directed_projection import directed_projection, mean_distance, reach_of
 from jaxfit._base._grid_smoothing import smoothed
-from jaxfit._base._host_splines import Frame, applied, basis_matrix, greville
-from jaxfit._base._method import AbstractBaseMethod, Knots
-from jaxfit._base._pull import mean_distance, pull, reach_of
+from jaxfit._base._host_splines import Frame, Knots, along_both, basis_matrix
+from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
+from jaxfit._splines._knots import greville
 
 GAIN = 0.01  # a mean distance has fallen if it did so by this share
 IDLE = 2  # grids that lower nothing before the end
@@ -63,10 +64,22 @@ class DynamicBaseSurface(AbstractBaseMethod):
     the paper: displacements are smoothed rather than positions, and a pull counts less where few
     points are near the normal line.
 
-    Raises ValueError for options out of range, and for surfaces outside three dimensions.
-
     Source: P. N. Azariadis, Parameterization of clouds of unorganized points using dynamic base surfaces,
     Computer-Aided Design 36 (2004).
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range, or the boundary is not in three dimensions.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 13), np.linspace(0, 1, 13), indexing="ij")
+    >>> grid = np.stack([x, y, 4 * x * (1 - x) * y * (1 - y)], axis=2)
+    >>> boundary, points = jf.Boundary.from_grid(grid), grid[1:-1, 1:-1].reshape(-1, 3)
+    >>> surface = jf.base_surface(boundary, points, net=(8, 8), method=jf.DynamicBaseSurface())
+    >>> abs(float(surface(0.5, 0.5)[2]) - 0.25) < 0.05
+    True
     """
 
     start: int = 4
@@ -118,7 +131,9 @@ class DynamicBaseSurface(AbstractBaseMethod):
         for _ in range(self.rounds):
             grid, normals = level.frame.points(net), level.frame.normals(net)
             reach = reach_of(grid, points, self.reach)
-            moves, sure = pull(grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points)
+            moves, sure = directed_projection(
+                grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points
+            )
             moved = grid - level.base + moves.reshape(reach.shape)[..., None] * normals
             net = level.interpolated(smoothed(moved, sure.reshape(reach.shape), self.stiffness))
             distance = mean_distance(net, level.knots, level.order, points)
@@ -150,7 +165,7 @@ class _Level:
 
     def interpolated(self, displacements: np.ndarray) -> np.ndarray:
         """The Coons net plus the spline through the displacements, whose border is zero."""
-        extra = applied(self._lift[0], displacements, self._lift[1])
+        extra = along_both(self._lift[0], displacements, self._lift[1])
         extra[[0, -1]] = 0.0
         extra[:, [0, -1]] = 0.0
         return self.coons + extra

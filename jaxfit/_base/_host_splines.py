@@ -17,14 +17,7 @@ def basis_matrix(
     return BSpline(knots, np.eye(len(knots) - order), order - 1)(u, derivative)
 
 
-def greville(knots: Float[Any, " knots"], order: int) -> Float[Any, " n"]:
-    """Means of order - 1 consecutive knots: where interpolation is always possible."""
-    sums = np.cumsum(np.concatenate([[0.0], knots]))
-    places = (sums[order : len(knots)] - sums[1 : len(knots) - order + 1]) / (order - 1)
-    return np.clip(places, knots[0], knots[-1])
-
-
-def applied(
+def along_both(
     first: Float[Any, "a n"], net: Float[Any, "n m d"], second: Float[Any, "b m"]
 ) -> Float[Any, "a b d"]:
     """One matrix along each direction of a net."""
@@ -40,11 +33,29 @@ class Frame:
 
     def points(self, net: Float[Any, "nu nv d"]) -> Float[Any, "a b d"]:
         """R(u_a, v_b)."""
-        return applied(self._u[0], net, self._v[0])
+        return along_both(self._u[0], net, self._v[0])
 
     def normals(self, net: Float[Any, "nu nv 3"]) -> Float[Any, "a b 3"]:
         """Unit normals, zero where the surface has none."""
-        along_u = applied(self._u[1], net, self._v[0])
-        cross = np.cross(along_u, applied(self._u[0], net, self._v[1]))
+        along_u = along_both(self._u[1], net, self._v[0])
+        cross = np.cross(along_u, along_both(self._u[0], net, self._v[1]))
         length = np.linalg.norm(cross, axis=2, keepdims=True)
         return cross / np.where(length > 0, length, 1.0)
+
+
+def halve_widest_spans(
+    net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], least: tuple[int, int]
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """The same surface, its widest spans halved until it has at least so many control points each way."""
+    from scipy.interpolate import BSpline
+
+    refined = []
+    for axis in (0, 1):
+        curve = BSpline(knots[axis], np.moveaxis(net, axis, 0), order[axis] - 1)
+        while (count := len(curve.t) - order[axis]) < least[axis]:
+            widths = np.diff(curve.t)
+            widest = int(np.argmax(widths > widths.max() * (1 - 1e-9)))
+            curve = curve.insert_knot((curve.t[widest] + curve.t[widest + 1]) / 2)
+        net = np.moveaxis(curve.c[:count], 0, axis)
+        refined.append(curve.t)
+    return net, (refined[0], refined[1])

@@ -7,10 +7,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from jaxfit._base._boundary import Boundary
-from jaxfit._base._cloud import cloud_of
+from jaxfit._base._delaunay_stars import Stars, mean_value_weights, stars
 from jaxfit._base._douglas_peucker import chord_lengths, densify
-from jaxfit._base._stars import Stars, mean_value_weights, stars
-from jaxfit._base._stretch import area_stretch, link_weights
+from jaxfit._base._normalised_cloud import cloud_of
+from jaxfit._base._parametric_stretch import area_stretch, link_weights
 from jaxfit._checks import as_points, check_kind, check_number, eager_where_concrete, is_concrete
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
@@ -84,6 +84,16 @@ def meshless_parameters(
     Sources: M. S. Floater, M. Reimers, Meshless parameterization and surface reconstruction, CAGD 18 (2001);
     S. Yoshizawa, A. Belyaev, H.-P. Seidel, A fast and simple stretch-minimizing mesh parameterization,
     Shape Modeling International (2004).
+
+    Examples
+    --------
+    Points of a flat square keep their places:
+
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 7), indexing="ij")
+    >>> grid = np.stack([x, y, 0 * x], axis=2)
+    >>> u, v = jf.meshless_parameters(grid[1:-1, 1:-1].reshape(-1, 3), jf.Boundary.from_grid(grid))
+    >>> bool(np.allclose(u, x[1:-1, 1:-1].ravel(), atol=1e-6))
+    True
     """
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     check_number("neighbours", neighbours, 6, whole=True)
@@ -168,7 +178,7 @@ def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "node
     i = np.repeat(np.arange(count), star.filled.sum(axis=1))
     weights = weights / weights.sum(axis=1, keepdims=True)
     graph = csr_array((weights[star.filled], (i, star.members[star.filled])), shape=(count, count))
-    graph = _tied(graph, nodes.points, pinned)
+    graph = _connect_components(graph, nodes.points, pinned)
     graph = diags_array(1 / graph.sum(axis=1)) @ graph
     if count == pinned:
         return nodes.fixed
@@ -179,7 +189,7 @@ def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "node
     return np.concatenate([nodes.fixed, np.clip(inner, 0.0, 1.0)])
 
 
-def _tied(graph: Any, points: np.ndarray, pinned: int) -> Any:
+def _connect_components(graph: Any, points: np.ndarray, pinned: int) -> Any:
     """The graph with links for groups of points from which no path leads to the boundary."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components

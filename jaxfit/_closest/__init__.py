@@ -11,8 +11,7 @@ from jaxfit._closest._foot_update import update_feet as update_feet
 from jaxfit._closest._forms import dot as dot
 from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._iterate_feet import PointSums as PointSums
-from jaxfit._closest._on_host import globally as globally
-from jaxfit._closest._on_host import padded as padded
-from jaxfit._closest._on_host import prepare as prepare
+from jaxfit._closest._nearest_feet import HostFeet as HostFeet
+from jaxfit._closest._nearest_feet import nearest_feet as nearest_feet
 from jaxfit._closest._project import Border as Border
 from jaxfit._closest._project import project as project

@@ -21,7 +21,7 @@ from jaxfit._checks import (
 )
 from jaxfit._closest._foot_methods import AbstractFootMethod, Newton
 from jaxfit._closest._implicit import foot_parameters
-from jaxfit._closest._on_host import feet_on_host
+from jaxfit._closest._nearest_feet import nearest_feet
 from jaxfit._precision import advise_x64, default_foot_tolerance
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface
@@ -188,7 +188,9 @@ def _on_host(
     net, knots_u, knots_v = arrays
     orders = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
     axes = make_axis(knots_u, orders[0]), make_axis(knots_v, orders[1])
-    best = feet_on_host(method, net, *axes, np.asarray(points), start, tolerance, max_steps)
+    best = nearest_feet(
+        method, net, *axes, np.asarray(points), start=start, tolerance=tolerance, max_steps=max_steps
+    )
     u, v, f, converged = (best[name] for name in ("u", "v", "f", "converged"))
     status = _status(axes[0].breaks, axes[1].breaks, u, v, converged, orders[1] == 1)
     with np.errstate(invalid="ignore"):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import Border, project
-from jaxfit._closest._seeds import best_samples, sample
+from jaxfit._closest._samples import best_samples, sample_points
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import make_pieces
 
@@ -55,7 +55,8 @@ def _found(
         feet = project(method, pieces, target, *start, tolerance, max_steps)
         return feet.best_u, feet.best_v, feet.converged, feet.steps
     count = target.shape[1]
-    u, v = best_samples(sample(pieces), target)
+    samples = sample_points(net - centre[None, None, :], pieces.axis_u, pieces.axis_v)
+    u, v = best_samples(*samples, target)
     twice = jnp.concatenate([target, target], axis=1)
     feet = project(method, pieces, twice, u.reshape(-1), v.reshape(-1), tolerance, max_steps)
     second = feet.best[count:] < feet.best[:count]

@@ -23,7 +23,7 @@ def initial_feet(
     within: Border | None,
     done: int,
 ) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
-    """Feet at the nearest places to (u, v) in the domain, `idle` ones in the state `done`; and their bounds."""
+    """Feet at the nearest places to (u, v) in the domain, and their bounds; `idle` ones are `done`."""
     low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
     u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
     feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
@@ -49,12 +49,13 @@ def project(
     tolerance: Array,
     max_steps: Array,
     idle: Bool[Array, " points"] | None = None,
-    borders: bool = True,
+    borders: bool | Bool[Array, ""] = True,
     within: Border | None = None,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, feet that do not converge are looked for on the four border curves (section 3.1
-    of the paper). With `within`, bounds of every foot's own, feet are looked for nowhere else.
+    they are. With `borders`, which may be traced, feet that do not converge are looked for on the four
+    border curves (section 3.1 of the paper). With `within`, bounds of every foot's own, feet are looked for
+    nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
@@ -62,19 +63,22 @@ def project(
     pieces = jax.tree.map(jnp.asarray, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     feet, bounds = initial_feet(pieces, u, v, idle, within, FOUND)
-    if within is not None or not borders:
+    if within is not None or borders is False:
         return iterate_feet(method, pieces, target, feet, limits, bounds)[0]
-    return _in_stages(method, pieces, target, feet, limits)
+    return _in_stages(method, pieces, target, feet, limits, jnp.where(borders, AGAIN, EVERYWHERE))
 
 
-def _in_stages(method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits) -> Feet:
-    """Stages: 0 everywhere; 1-4 one border each, for feet that have not converged; 5 everywhere again,
-    from the nearest of what was found, so that "converged" always means: with respect to the whole surface.
+def _in_stages(
+    method: AbstractFootMethod, pieces: Pieces, target: Array, feet: Feet, limits: Limits, last: Array
+) -> Feet:
+    """Stages up to the `last`: 0 everywhere; 1-4 one border each, for feet that have not converged; 5
+    everywhere again, from the nearest of what was found, so that "converged" always means: with respect to
+    the whole surface.
     """
 
     def unsettled(carry: tuple[Array, Feet]) -> Array:
         number, feet = carry
-        return (number <= AGAIN) & jnp.any(~feet.converged)
+        return (number <= last) & jnp.any(~feet.converged)
 
     def stage(carry: tuple[Array, Feet]) -> tuple[Array, Feet]:
         number, old = carry

@@ -4,6 +4,7 @@ from jaxfit._fit._border import FixedBorder as FixedBorder
 from jaxfit._fit._border import FixedCorners as FixedCorners
 from jaxfit._fit._border import FixedSides as FixedSides
 from jaxfit._fit._border import FreeBorder as FreeBorder
+from jaxfit._fit._border import held_points as held_points
 from jaxfit._fit._history import ErrorHistory as ErrorHistory
 from jaxfit._fit._history import History as History
 from jaxfit._fit._method import AbstractIterativeMethod as AbstractIterativeMethod

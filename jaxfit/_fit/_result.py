@@ -41,9 +41,9 @@ class Fit(eqx.Module):
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
         foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
-        interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest distance
-        between a data point and the mirror image of its partner, as a fraction of the diagonal. Other entries
-        stand with the methods that add them.
+        interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
+        distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
+        Other entries stand with the methods that add them.
     """
 
     surface: BSplineSurface
@@ -74,8 +74,8 @@ class Fit(eqx.Module):
         moved = 0.5 * self.stats.get("asymmetry", 0.0)
         if is_concrete(moved) and np.ndim(moved) == 0 and moved > self.stats.get("tolerance", np.inf):
             return (
-                f"{sentences[self.result]} Errors are measured to the symmetrised grid, whose points lie up to "
-                f"{float(moved):.2g} of the diagonal away from the given ones."
+                f"{sentences[self.result]} Errors are measured to the symmetrised grid, whose points lie up "
+                f"to {float(moved):.2g} of the diagonal away from the given ones."
             )
         return sentences[self.result]
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -78,20 +79,27 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, A
     unit = jnp.eye(nv, dtype=entries.dtype)
     floor = FLOOR * jnp.max(entries[0, 0])
 
-    def step(window: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array, Array]]:
+    def step(window: list[Array], row: tuple[Array, Array]) -> tuple[list[Array], tuple[Array, ...]]:
         number, bands = row
         mask = lax.dynamic_slice_in_dim(ahead, number, order)
         column = jnp.where(mask[:, :, None] & mask[0][None, None, :], _blocks(bands), 0.0)
         added = shift * unit * jnp.maximum(jnp.diagonal(column[0]), floor)[:, None]
         own = jnp.where(mask[0][:, None], column[0] + added, unit)
-        rest = column[1:].reshape(reach, nv) - jnp.pad(window[nv:, :nv], ((0, nv), (0, 0)))
-        inverse, least = _inverted(own - window[:nv, :nv], jnp.diagonal(own))
+        rest = column[1:].reshape(reach, nv) - _with_row_below(window[0][nv:])
+        inverse, least = _inverted(own - window[0][:nv], jnp.diagonal(own))
         below = rest @ inverse
-        after = jnp.pad(window[nv:, nv:], ((0, nv), (0, nv)))
-        return after + below @ rest.T, (inverse, below, least)
+        after = [below[j * nv :] @ rest[j * nv : (j + 1) * nv].T for j in range(order - 1)]
+        kept = [_with_row_below(x) for x in window[1:]]
+        after = [x + y for x, y in zip(kept, after, strict=False)] + after[order - 2 :]
+        return after, (inverse, below, least)
+
+    def _with_row_below(x: Array) -> Array:
+        return jnp.pad(x, ((0, nv), (0, 0)))
 
     rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(2, 0, 1, 3))
-    _, (inverse, below, least) = lax.scan(step, jnp.zeros((reach, reach), entries.dtype), rows)
+    # What is taken off the rows to come: by columns of blocks, from the diagonal down.
+    window = [jnp.zeros((reach - j * nv, nv), entries.dtype) for j in range(order - 1)]
+    _, (inverse, below, least) = lax.scan(step, window, rows)
     return inverse, below, jnp.min(least)
 
 
@@ -103,29 +111,29 @@ def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Arr
 
     def sweep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, least = carry
-        row = lax.dynamic_slice(matrix, (k, 0), (1, count))
-        column = lax.dynamic_slice(matrix, (0, k), (count, 1))
-        pivot = lax.dynamic_slice(row, (0, k), (1, 1))
+        zero = np.zeros((), k.dtype)
+        row = lax.dynamic_slice(matrix, (k, zero), (1, count), allow_negative_indices=False)
+        column = lax.dynamic_slice(matrix, (zero, k), (count, 1), allow_negative_indices=False)
+        pivot = lax.dynamic_slice(row, (zero, k), (1, 1), allow_negative_indices=False)
+        own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
         across, along = (number == k)[None, :], (number == k)[:, None]
         share = jnp.where(along, -1.0, column) * (jnp.where(across, -1.0, row) / pivot)
         swept = jnp.where(across | along, 0.0, matrix) - share
-        return swept, jnp.minimum(least, pivot[0, 0] / size[k])
+        return swept, jnp.minimum(least, pivot[0] / own)
 
-    most = jnp.asarray(jnp.inf, block.dtype)
+    most = jnp.full(1, jnp.inf, block.dtype)
     swept, least = lax.fori_loop(0, count, sweep, (block, most))
     return -swept, least
 
 
 def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
     """Dense symmetric blocks from their bands, `bands[:, b, j]` standing at (j, j + b) and (j + b, j)."""
-    _, order, count = bands.shape
-    number = jnp.arange(count)
-    apart = number[None, :] - number[:, None]
-    total: Any = jnp.where(apart == 0, bands[:, 0, :, None], 0.0)
-    for b in range(1, order):
-        total = jnp.where(apart == b, bands[:, b, :, None], total)
-        total = jnp.where(apart == -b, bands[:, b, None, :], total)
-    return total
+    blocks, order, count = bands.shape
+    i, j = np.indices((count, count), np.int32)
+    # Entries farther from the diagonal are read from the zeros behind the bands.
+    place = np.where(abs(i - j) < order, abs(i - j) * count + np.minimum(i, j), order * count)
+    flat = jnp.pad(bands.reshape(blocks, order * count), ((0, 0), (0, 1)))
+    return jnp.take(flat, place, axis=1, mode="clip")
 
 
 def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array, "nu nv c"]:

@@ -8,6 +8,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 Operator = Callable[[Array], Array]
+Carry = tuple[Array, Array, Array, Array, Array]
 
 
 class Solution(NamedTuple):
@@ -38,11 +39,11 @@ def conjugate_gradients(
     def inner(x: Array, y: Array) -> Array:
         return jnp.sum(x * y, axis=None if coupled else (0, 1), keepdims=True)
 
-    def unfinished(carry: tuple[Array, ...]) -> Array:
+    def unfinished(carry: Carry) -> Array:
         _, _, _, slope, steps = carry
         return jnp.any(slope > goal) & (steps < max_steps)
 
-    def step(carry: tuple[Array, ...]) -> tuple[Array, ...]:
+    def step(carry: Carry) -> Carry:
         net, left, along, slope, steps = carry
         image = matrix(along)
         length = _ratio(slope, inner(along, image))

@@ -50,7 +50,7 @@ class CoupledStencil(eqx.Module):
 
     def dense(self) -> Float[Array, "n n"]:
         """All entries, the coordinates running fastest; for small nets and for tests."""
-        d, nu, nv = self.entries.shape[0], *self.entries.shape[4:]
+        d, _, _, _, nu, nv = self.entries.shape
         unit = jnp.eye(nu * nv * d, dtype=self.entries.dtype).reshape(-1, nu, nv, d)
         return jax.vmap(self)(unit).reshape(nu * nv * d, nu * nv * d)
 

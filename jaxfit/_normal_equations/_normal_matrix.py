@@ -13,13 +13,12 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import Rows
+from jaxfit._cells import Rows, row_moments
 from jaxfit._normal_equations._stencil import Stencil, overlap_add, windows
 from jaxfit._splines._pieces import Axis
 
-# Powers of so many points are held at once, 112 bytes each for bicubic: within the caches' reach, and large
-# enough for several cores.
-SLOTS_AT_ONCE = 1 << 17
+# On a CPU, powers and moments of so many points stay in a core's caches. Elsewhere all go at once.
+SLOTS_AT_ONCE = 4096
 
 
 def normal_stencil(
@@ -30,54 +29,36 @@ def normal_stencil(
     axis_u: Axis,
     axis_v: Axis,
 ) -> Stencil:
-    """sum_k w_k N_i N_i' (u_k) N_j N_j' (v_k) for all pairs of control points, empty slots having weight 0.
-
-    Memory: O(points), whatever the net.
-    """
-    cells, size = axis_u.cells * axis_v.cells, (2 * _order(axis_u) - 1, 2 * _order(axis_v) - 1)
-    at_once = max(SLOTS_AT_ONCE // s.shape[1], 1)
-    if s.shape[0] <= at_once:
-        moments = _cell_moments(rows.cell, s, t, weight, size, cells)
-    else:
-        moments = _in_blocks(rows, s, t, weight, size, cells, at_once)
-    return Stencil(entries_of_moments(moments.reshape(cells, *size, 1), axis_u, axis_v)[0])
+    """sum_k w_k N_i N_i' (u_k) N_j N_j' (v_k) for all pairs of control points; empty slots have weight 0."""
+    orders = 2 * _order(axis_u) - 1, 2 * _order(axis_v) - 1
+    moments = cell_moments(rows, s, t, weight[None], orders, axis_u.cells * axis_v.cells)
+    return Stencil(entries_of_moments(moments[..., None], axis_u, axis_v)[0])
 
 
-def _in_blocks(
-    rows: Rows, s: Array, t: Array, weight: Array, size: tuple[int, int], cells: int, at_once: int
-) -> Array:
-    """Sums over one block of rows after the other. The last block overlaps the one before: rows that have
-    been added up already weigh nothing there."""
+def cell_moments(
+    rows: Rows,
+    s: Float[Array, "rows width"],
+    t: Float[Array, "rows width"],
+    values: Float[Array, "c rows width"],
+    orders: tuple[int, int],
+    cells: int,
+) -> Float[Array, "cells A Bc"]:
+    """Sums over each cell of s^a t^b x, laid out as by `row_moments`; empty slots have values 0."""
+    count, width = s.shape
+    size = min(count, max(SLOTS_AT_ONCE // width, 1)) if jax.default_backend() == "cpu" else count
 
     def block(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         start, total = carry
-        begin = jnp.minimum(start, s.shape[0] - at_once)
-        cell, x, y, w = (lax.dynamic_slice_in_dim(z, begin, at_once) for z in (rows.cell, s, t, weight))
-        fresh = begin + jnp.arange(at_once, dtype=jnp.int32) >= start
-        w = jnp.where(fresh[:, None], w, 0.0)
-        return start + at_once, total + _cell_moments(cell, x, y, w, size, cells)
+        begin = jnp.minimum(start, count - size)
+        cell, x, y = (lax.dynamic_slice_in_dim(z, begin, size) for z in (rows.cell, s, t))
+        value = lax.dynamic_slice_in_dim(values, begin, size, axis=1)
+        # The last block overlaps the one before, whose rows have been added up.
+        fresh = begin + jnp.arange(size, dtype=jnp.int32) >= start
+        value = jnp.where(fresh[None, :, None], value, 0.0)
+        return start + size, total.at[cell].add(row_moments(x, y, value, *orders))
 
-    nothing = jnp.zeros((cells, size[0] * size[1]), s.dtype)
-    begin = (jnp.asarray(0, jnp.int32), nothing)
-    return lax.while_loop(lambda x: x[0] < rows.used, block, begin)[1]
-
-
-def _cell_moments(
-    cell: Array, s: Array, t: Array, weight: Array, size: tuple[int, int], cells: int
-) -> Float[Array, "cells moments"]:
-    """Broadcast products, summed along the row, then rows of one cell added up."""
-    powers_s, powers_t = powers(s, size[0]), weight[None] * powers(t, size[1])
-    sums = jnp.sum(powers_s[:, None] * powers_t[None, :], axis=-1)
-    sums = sums.reshape(size[0] * size[1], -1).T
-    return jax.ops.segment_sum(sums, cell, cells)
-
-
-def powers(x: Float[Array, "rows width"], count: int) -> Float[Array, "count rows width"]:
-    """1, x, x^2, ..."""
-    each = [jnp.ones_like(x)]
-    for _ in range(count - 1):
-        each.append(each[-1] * x)
-    return jnp.stack(each)
+    nothing = jnp.zeros((cells, orders[0], orders[1] * values.shape[0]), s.dtype)
+    return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), nothing))[1]
 
 
 def entries_of_moments(

@@ -17,14 +17,14 @@ from jaxtyping import Bool, Float
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Rows,
+    cells_to_net,
     evaluate_values,
     local_coordinates,
-    net_sums,
     row_coefficients,
     row_width,
     rows_of,
 )
-from jaxfit._normal_equations._normal_matrix import normal_stencil
+from jaxfit._normal_equations._normal_matrix import cell_moments, normal_stencil
 from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
@@ -74,13 +74,11 @@ class RegularisedSystem(eqx.Module):
 
     def data_adjoint(self, residual: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
         """A^T sqrt(w) times a residual of the data."""
-
-        def sums(residual: Array) -> Array:
-            polynomials = self.axis_u.polynomials, self.axis_v.polynomials
-            return net_sums(self.rows, self.s, self.t, self.root[None] * residual, *polynomials)
-
-        # Stored, or each of the many sums would compute the residual for itself.
-        return materialise(self.root[0, 0] >= 0, sums, residual)
+        polynomials = self.axis_u.polynomials, self.axis_v.polynomials
+        orders, cells = [x.shape[1] for x in polynomials], self.axis_u.cells * self.axis_v.cells
+        values = self.root[None] * residual
+        moments = cell_moments(self.rows, self.s, self.t, values, (orders[0], orders[1]), cells)
+        return cells_to_net(moments, *polynomials)
 
 
 def make_system(

@@ -49,7 +49,7 @@ def _raised(weights: Float[Array, "p *shape"], away: Float[Array, "local *shape"
     width = right - left
     # Two quotients, not one and its complement: small weights keep their relative accuracy,
     # and the end weights of a clamped knot vector are exactly zero and one.
-    return _padded(weights * (right / width), 0, 1) - _padded(weights * (left / width), 1, 0)
+    return _between_zeros(weights * (right / width), 0, 1) - _between_zeros(weights * (left / width), 1, 0)
 
 
 def _differentiated(
@@ -58,10 +58,10 @@ def _differentiated(
     """The same step for the derivative: N'_{i,p+1} = p (N_{i,p}/(..) - N_{i+1,p}/(..))."""
     p, middle = weights.shape[0], local.shape[0] // 2
     slope = p * weights / (local[middle : middle + p] - local[middle - p : middle])
-    return _padded(slope, 1, 0) - _padded(slope, 0, 1)
+    return _between_zeros(slope, 1, 0) - _between_zeros(slope, 0, 1)
 
 
-def _padded(x: Array, before: int, after: int) -> Array:
+def _between_zeros(x: Array, before: int, after: int) -> Array:
     """`x` between so many zeros along the first axis."""
     return lax.pad(x, np.zeros((), x.dtype), [(before, after, 0), *[(0, 0, 0)] * (x.ndim - 1)])
 

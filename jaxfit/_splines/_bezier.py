@@ -21,6 +21,13 @@ class BezierCurves(NamedTuple):
     control_points : array (spans, K, d)
     breakpoints : array (spans + 1,)
         Piece $s$ covers the parameters between breakpoints $s$ and $s + 1$.
+
+    Examples
+    --------
+    >>> curve = jf.BSplineCurve(np.array([[0.0], [1.0], [0.0]]), np.array([0.0, 0.0, 0.5, 1.0, 1.0]))
+    >>> pieces = curve.split()
+    >>> print(pieces.breakpoints, pieces.control_points[..., 0].tolist())
+    [0.  0.5 1. ] [[0.0, 1.0], [1.0, 0.0]]
     """
 
     control_points: Float[Array, "spans order d"]
@@ -28,13 +35,20 @@ class BezierCurves(NamedTuple):
 
 
 class BezierPatches(NamedTuple):
-    """Tensor-product pieces, one per rectangle of non-empty spans.
+    r"""Tensor-product pieces in Bezier form, one per rectangle of non-empty spans.
 
     Attributes
     ----------
     control_points : array (spans_u, spans_v, K, L, d)
     breakpoints_u : array (spans_u + 1,)
     breakpoints_v : array (spans_v + 1,)
+
+    Examples
+    --------
+    >>> knots_u, knots_v = np.array([0.0, 0.0, 0.5, 1.0, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
+    >>> patches = jf.BSplineSurface(np.ones((3, 2, 3)), knots_u, knots_v).split()
+    >>> patches.control_points.shape
+    (2, 1, 2, 2, 3)
     """
 
     control_points: Float[Array, "spans_u spans_v K L d"]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxfit._splines._basis import as_parameters
 from jaxfit._splines._bezier import BezierCurves, bezier_along
-from jaxfit._splines._construct import checked_derivative, checked_net, checked_new_knots
+from jaxfit._splines._checked_arguments import checked_derivative, checked_net, checked_new_knots
 from jaxfit._splines._evaluate import evaluate_curve
 from jaxfit._splines._insertion import insert_along
 from jaxfit._splines._knots import greville_abscissae
@@ -45,6 +45,15 @@ class BSplineCurve(eqx.Module):
     derivative at a knot is the one from the right, at the right end the one from the left.
     Parameters outside the domain are moved to its nearest end unless `extrapolate=True`, which
     continues the end pieces; NaN in gives NaN out.
+
+    Examples
+    --------
+    A parabola, its point and its tangent in the middle:
+
+    >>> points, knots = np.array([[0.0, 0.0], [0.5, 1.0], [1.0, 0.0]]), np.array([0.0, 0, 0, 1, 1, 1])
+    >>> curve = jf.BSplineCurve(points, knots)
+    >>> curve.order, curve(0.5).tolist(), curve.derivative(0.5).tolist()
+    (3, [0.5, 0.5], [1.0, 0.0])
     """
 
     control_points: Float[Array, "n d"]

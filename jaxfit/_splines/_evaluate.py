@@ -69,7 +69,7 @@ def evaluate_surface(
         dus, dvs = zip(*wanted, strict=True)
         i, weights_u = spans_and_weights(knots_u, orders[0], u, dus, extrapolate)
         j, weights_v = spans_and_weights(knots_v, orders[1], v, dvs, extrapolate)
-        block = _blocks(control_points, i, j, orders)
+        block = _influencing_points(control_points, i, j, orders)
         # A derivative does not see the origin: moving it near keeps the digits of far points.
         near = block - block[:, :1, :1]
         weights = zip(wanted, weights_u.swapaxes(1, 2), weights_v.swapaxes(1, 2), strict=True)
@@ -81,7 +81,7 @@ def evaluate_surface(
     return tuple(result[..., k, :] for k in range(len(wanted)))
 
 
-def _blocks(
+def _influencing_points(
     control_points: Float[Array, "nu nv d"],
     i: Int[Array, " points"],
     j: Int[Array, " points"],

@@ -10,7 +10,24 @@ Partials = dict[tuple[int, int], Array]
 
 
 class FirstForm(NamedTuple):
-    """First fundamental form, each coefficient of the shape of the parameters."""
+    r"""First fundamental form $E\,du^2 + 2 F\,du\,dv + G\,dv^2$: lengths on a surface.
+
+    Each coefficient has the shape of the parameters, and the unit length^2. From
+    `BSplineSurface.first_form`, in any dimension.
+
+    Attributes
+    ----------
+    E, F, G : array
+        $R_u \cdot R_u$, $R_u \cdot R_v$, $R_v \cdot R_v$.
+
+    Examples
+    --------
+    >>> net = np.array([[[0.0, 0, 0], [1, 3, 0]], [[2, 0, 0], [3, 3, 0]]])
+    >>> knots = np.array([0.0, 0, 1, 1])
+    >>> form = jf.BSplineSurface(net, knots, knots).first_form(0.5, 0.5)
+    >>> float(form.E), float(form.F), float(form.G)
+    (4.0, 2.0, 10.0)
+    """
 
     E: Float[Array, "*shape"]
     F: Float[Array, "*shape"]
@@ -18,7 +35,24 @@ class FirstForm(NamedTuple):
 
 
 class SecondForm(NamedTuple):
-    """Second fundamental form, each coefficient of the shape of the parameters."""
+    r"""Second fundamental form $L\,du^2 + 2 M\,du\,dv + N\,dv^2$: distances from the tangent plane.
+
+    Each coefficient has the shape of the parameters, and the unit length. From
+    `BSplineSurface.second_form`, in three dimensions.
+
+    Attributes
+    ----------
+    L, M, N : array
+        $R_{uu} \cdot n$, $R_{uv} \cdot n$, $R_{vv} \cdot n$ with the unit normal n.
+
+    Examples
+    --------
+    >>> net = np.array([[[0.0, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 1]]])
+    >>> knots = np.array([0.0, 0, 1, 1])
+    >>> form = jf.BSplineSurface(net, knots, knots).second_form(0.0, 0.0)
+    >>> float(form.L), float(form.M), float(form.N)
+    (0.0, 1.0, 0.0)
+    """
 
     L: Float[Array, "*shape"]
     M: Float[Array, "*shape"]
@@ -38,6 +72,16 @@ class Curvature(NamedTuple):
         Principal curvatures, $k_1 \ge k_2$; positive where the surface bends towards the normal
         $R_u \times R_v$. At umbilics ($k_1 = k_2$) they have no derivative, and automatic
         differentiation gives that of the mean curvature.
+
+    Examples
+    --------
+    The saddle z = u v at its centre:
+
+    >>> net = np.array([[[0.0, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 1]]])
+    >>> knots = np.array([0.0, 0, 1, 1])
+    >>> at_centre = jf.BSplineSurface(net, knots, knots).curvature(0.0, 0.0)
+    >>> [round(float(x), 6) + 0.0 for x in (at_centre.gaussian, at_centre.mean, at_centre.k1, at_centre.k2)]
+    [-1.0, 0.0, 1.0, -1.0]
     """
 
     gaussian: Float[Array, "*shape"]

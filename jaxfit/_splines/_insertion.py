@@ -45,7 +45,7 @@ def insertion_weights(
 def insertion_matrix(
     knots: Float[Array, " knots"], order: int, new_knots: ArrayLike
 ) -> Float[Array, "refined n"]:
-    r"""Matrix that takes control points to those on the refined knot vector.
+    r"""Matrix that takes control points to those on the refined knot vector (Oslo algorithm).
 
     Parameters
     ----------
@@ -61,6 +61,16 @@ def insertion_matrix(
     array (n + m, n)
         Row $j$ holds at most `order` entries, non-negative and of sum one. The spline is the
         same function to rounding.
+
+    Examples
+    --------
+    A knot in the middle of a parabola without interior knots cuts both legs of its control polygon:
+
+    >>> print(jf.insertion_matrix(jf.clamped_uniform_knots(3, 3), 3, np.array([0.5])))
+    [[1.  0.  0. ]
+     [0.5 0.5 0. ]
+     [0.  0.5 0.5]
+     [0.  0.  1. ]]
     """
     refined = refined_knots(knots, new_knots)
     first, weights = insertion_weights(knots, refined, order)

@@ -1,14 +1,14 @@
 """Knot vectors: uniform, from parameters, their Greville abscissae, and their union."""
 
-from functools import partial
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfit._checks import as_floating, is_concrete
+from jaxfit._splines._lookup import windows
 
 
 def clamped_uniform_knots(
@@ -29,17 +29,25 @@ def clamped_uniform_knots(
     ------
     ValueError
         If there are fewer control points than the order, or the domain is empty.
+
+    Examples
+    --------
+    Two spans of a cubic:
+
+    >>> print(jf.clamped_uniform_knots(5, 4))
+    [0.  0.  0.  0.  0.5 1.  1.  1.  1. ]
     """
     _check_count("count", count, order)
-    start, stop = (jnp.asarray(x, jnp.result_type(float, x)) for x in domain)
+    xp: Any = np if is_concrete(domain) else jnp
+    start, stop = (xp.asarray(x, jnp.result_type(float, x)) for x in domain)
     if is_concrete(start, stop) and not start < stop:
         raise ValueError(
             f"domain must increase, but runs from {float(start):g} to {float(stop):g}; "
             "give (start, stop) with start below stop."
         )
     spans = count - order + 1
-    inside = start + (stop - start) * (jnp.arange(1, spans) / spans)
-    return _clamped(start, inside, stop, order)
+    inside = start + (stop - start) * (np.arange(1, spans) / spans)
+    return jnp.asarray(_clamped(start, inside, stop, order))
 
 
 def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]:
@@ -66,8 +74,13 @@ def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]
     ValueError
         If there are fewer parameters than the order, the order is below 2, or the parameters
         decrease somewhere.
+
+    Examples
+    --------
+    >>> print(np.round(jf.averaging_knots(np.array([0.0, 0.1, 0.2, 0.6, 1.0]), 4), 3))
+    [0.  0.  0.  0.  0.3 1.  1.  1.  1. ]
     """
-    values = jnp.asarray(as_floating("parameters", parameters, 1))
+    values = as_floating("parameters", parameters, 1)
     count = values.shape[0]
     if order < 2:
         raise ValueError(f"order must be at least 2 (linear), but is {order}; raise it.")
@@ -79,11 +92,12 @@ def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]
                 f"parameters must not decrease, but parameters[{falls[0] + 1}] is smaller than "
                 "the one before it; sort them."
             )
-    return _averaged(values, order)
+    # By NumPy where it can be: every new length would compile anew.
+    return jnp.asarray(knots_by_averaging(np.asarray(values) if is_concrete(values) else values, order))
 
 
-@partial(jax.jit, static_argnames="order")
-def _averaged(parameters: Array, order: int) -> Array:
+def knots_by_averaging(parameters: Any, order: int) -> Any:
+    """`averaging_knots` of checked parameters, NumPy or JAX."""
     inside = _running_mean(parameters, order - 1)[: parameters.shape[0] - order]
     return _clamped(parameters[0], inside, parameters[-1], order)
 
@@ -100,14 +114,28 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
     knots : array (count + order,)
     order : int
         Degree + 1, at least 2.
+
+    Returns
+    -------
+    array (count,)
+
+    Raises
+    ------
+    ValueError
+        If the order is below 2 or not below the number of knots.
+
+    Examples
+    --------
+    >>> print(np.round(jf.greville_abscissae(jf.clamped_uniform_knots(5, 4), 4), 3))
+    [0.    0.167 0.5   0.833 1.   ]
     """
-    values = jnp.asarray(as_floating("knots", knots, 1))
+    values = as_floating("knots", knots, 1)
     if not 2 <= order < values.shape[0]:
         raise ValueError(
             f"order must lie between 2 and the number of knots {values.shape[0]} less one, "
             f"but is {order}; pass the order the knots were made for."
         )
-    return _running_mean(values, order - 1)[: values.shape[0] - order]
+    return jnp.asarray(greville(np.asarray(values) if is_concrete(values) else values, order))
 
 
 def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) -> Float[Array, " knots"]:
@@ -131,6 +159,14 @@ def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) 
     ------
     ValueError
         If a vector decreases, or the two domains differ by more than `tolerance`.
+    TypeError
+        If a vector is traced: the length of the result depends on the values.
+
+    Examples
+    --------
+    >>> a, b = np.array([0.0, 0.0, 0.5, 1.0, 1.0]), np.array([0.0, 0.0, 0.25, 0.5, 0.5, 1.0, 1.0])
+    >>> print(jf.merge_knots(a, b, 2))
+    [0.   0.   0.25 0.5  0.5  1.   1.  ]
     """
     if not is_concrete(a, b):
         raise TypeError("merge_knots needs concrete knots, but was traced; call it outside jit.")
@@ -174,19 +210,22 @@ def _sorted_values(name: str, knots: ArrayLike) -> np.ndarray:
     return values
 
 
-@partial(jax.jit, static_argnames="width")
-def _running_mean(values: Array, width: int) -> Array:
+def greville(knots: Any, order: int) -> Any:
+    """`greville_abscissae` of checked knots, NumPy or JAX."""
+    return _running_mean(knots, order - 1)[: knots.shape[0] - order]
+
+
+def _running_mean(values: Any, width: int) -> Any:
     """Means of `width` consecutive values, from the second value on."""
-    windows = [values[1 + i : values.shape[0] - width + 1 + i] for i in range(width)]
+    runs = windows(values, np.arange(1, values.shape[0] - width + 1), width)
     # Measured from the first one, so that the mean of equal knots is that knot to the last bit.
-    first = windows[0]
-    return first + sum(x - first for x in windows) / width
+    return runs[0] + (runs - runs[:1]).sum(0) / width
 
 
-def _clamped(start: Array, inside: Array, stop: Array, order: int) -> Array:
-    dtype = jnp.result_type(start, stop)
-    ends = [jnp.broadcast_to(x, (order,)).astype(dtype) for x in (start, stop)]
-    return jnp.concatenate([ends[0], inside.astype(dtype), ends[1]])
+def _clamped(start: Any, inside: Any, stop: Any, order: int) -> Any:
+    xp: Any = np if is_concrete(start, inside, stop) else jnp
+    ends = [xp.broadcast_to(x, (order,)) for x in (start, stop)]
+    return xp.concatenate([ends[0], inside.astype(ends[0].dtype), ends[1]])
 
 
 def _check_count(name: str, count: int, order: int) -> None:

@@ -185,14 +185,17 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
         left = xp.minimum(windows(local, np.arange(1, order + 1), order - 1), -1.0)
         if concrete:
             for each in left[::-1]:
-                basis = _raised(basis, each, right)
+                basis = _raised_polynomials(basis, each, right)
         else:
-            start = jnp.asarray(basis)
-            basis = lax.scan(lambda x, each: (_raised(x, each, right), None), start, left, reverse=True)[0]
+
+            def step(basis: Any, left: Any) -> tuple[Any, None]:
+                return _raised_polynomials(basis, left, right), None
+
+            basis = lax.scan(step, jnp.asarray(basis), left, reverse=True)[0]
     return basis.transpose(2, 0, 1)
 
 
-def _raised(basis: Any, left: Any, right: Any) -> Any:
+def _raised_polynomials(basis: Any, left: Any, right: Any) -> Any:
     """The polynomials of one degree more, for all supports, which begin at `left` and end at `right`."""
     share = basis / (right - left)
     shifted = _moved_on(share, 1)

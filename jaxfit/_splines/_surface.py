@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jaxfit._splines import _geometry
 from jaxfit._splines._basis import as_parameters
 from jaxfit._splines._bezier import BezierPatches, bezier_along
-from jaxfit._splines._construct import (
+from jaxfit._splines._checked_arguments import (
     checked_derivative,
     checked_net,
     checked_new_knots,
@@ -60,6 +60,19 @@ class BSplineSurface(eqx.Module):
     its nearest border, and a derivative is the one there (automatic differentiation through the
     parameter gives zero outside, and the one-sided derivative on the border). With
     `extrapolate=True` the border pieces continue. NaN in gives NaN out.
+
+    Examples
+    --------
+    The bilinear patch z = u v:
+
+    >>> net = np.array([[[0.0, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 1]]])
+    >>> knots = np.array([0.0, 0, 1, 1])
+    >>> surface = jf.BSplineSurface(net, knots, knots)
+    >>> surface(0.5, 0.5).tolist(), surface.derivative(0.5, 0.5, 1, 1).tolist()
+    ([0.5, 0.5, 0.25], [0.0, 0.0, 1.0])
+    >>> print(np.round(surface.normal(np.array([0.0, 1.0]), 0.0), 3) + 0.0)
+    [[ 0.     0.     1.   ]
+     [ 0.    -0.707  0.707]]
     """
 
     control_points: Float[Array, "nu nv d"]

@@ -1,6 +1,7 @@
 """Arrays from NumPy's files, which may be damaged or claim more than they hold."""
 
 import math
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -13,7 +14,15 @@ from numpy.lib import format as npy
 from jaxfit.io._point_data import InputError
 
 _LARGEST_RATIO = 1100  # by which deflating can shrink
-_DAMAGED = (ValueError, EOFError, KeyError, RuntimeError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_DAMAGED = (
+    ValueError,
+    EOFError,
+    KeyError,
+    RuntimeError,  # NotImplementedError among them
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def load_arrays(path: Path, names: Sequence[str]) -> tuple[dict[str, np.ndarray], list[str]]:

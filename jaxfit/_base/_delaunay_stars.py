@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._base._normals import frames, oriented
+from jaxfit._base._point_normals import frames, oriented
 
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many
@@ -67,7 +67,7 @@ def _among(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.nd
     order = np.argsort(angle, axis=1, kind="stable")
     members, filled, plane = _taken((members, filled, plane), order)
     members, filled, plane = _hulls(members, filled, plane)
-    return Stars(members, filled, plane, _gaps(plane, filled))
+    return Stars(members, filled, plane, _angles_between(plane, filled))
 
 
 def _with(
@@ -221,7 +221,7 @@ def _cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]
 
 
-def _gaps(plane: np.ndarray, filled: np.ndarray) -> np.ndarray:
+def _angles_between(plane: np.ndarray, filled: np.ndarray) -> np.ndarray:
     """Angle from each neighbour to the next; a single neighbour leaves a gap of a full turn."""
     after = around(plane, filled)[1]
     angle = np.arctan2(_cross(plane, after), np.sum(plane * after, axis=2))

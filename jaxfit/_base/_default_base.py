@@ -1,18 +1,18 @@
-"""The base surface of someone who has not chosen one."""
+"""The default base surface."""
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base._base_surface import base_surface
 from jaxfit._base._boundary import Boundary, diagonal
+from jaxfit._base._directed_projection import mean_distance
 from jaxfit._base._meshless import Meshless
-from jaxfit._base._pull import mean_distance
 from jaxfit._splines import BSplineSurface
 
 FAR = 5e-3  # of the diagonal: where feet on a blend of the sides are likely to be wrong ones
 
 
-def chosen_base(
+def default_base(
     boundary: Boundary,
     points: Float[np.ndarray, "points d"],
     net: tuple[int, int],
@@ -22,15 +22,15 @@ def chosen_base(
     coons = base_surface(boundary, points, net=net, order=order)
     if points.shape[1] != 3:
         return coons
-    away = _away(coons, points)
-    if away <= FAR * diagonal(points):
+    distance = _mean_distance(coons, points)
+    if distance <= FAR * diagonal(points):
         return coons
     other = base_surface(boundary, points, net=net, order=order, method=Meshless())
-    return other if _away(other, points) < away else coons
+    return other if _mean_distance(other, points) < distance else coons
 
 
-def _away(surface: BSplineSurface, points: Float[np.ndarray, "points 3"]) -> float:
-    """Mean distance of the points, about the origin of which the numbers keep their digits."""
+def _mean_distance(surface: BSplineSurface, points: Float[np.ndarray, "points 3"]) -> float:
+    """Mean distance of the points, computed about their centre, which keeps digits."""
     middle = points.mean(axis=0, dtype=np.float64)
     net = np.asarray(surface.control_points, np.float64) - middle
     knots = (np.asarray(surface.knots_u, np.float64), np.asarray(surface.knots_v, np.float64))

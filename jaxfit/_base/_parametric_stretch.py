@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._stars import WIDEST, Stars, around
+from jaxfit._base._delaunay_stars import WIDEST, Stars, around
 
 LONGEST = 4.0  # times the median length in the domain per length in space; longer links count less
 STEEPEST = 5.0  # times the median: the most that a stretch counts in one reweighting

@@ -15,7 +15,7 @@ FINEST = 1e-9  # of the diagonal: the least reach
 SAMPLES = 160  # along each direction, to measure distances
 
 
-def pull(
+def directed_projection(
     grid: Float[Any, "grid 3"],
     normals: Float[Any, "grid 3"],
     reach: Float[Any, " grid"],

@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxfit._base._curve_fit import CurveStart
 from jaxfit._base._douglas_peucker import chord_lengths, densify, simplify
+from jaxfit._splines._knots import knots_by_averaging
 
 MOST_VERTICES = 64  # of a boundary curve whose size follows from the tolerance
 MOST_POINTS = 4000  # of a polyline that take part in the fit; longer ones are thinned evenly
@@ -24,10 +25,10 @@ def starts_by_tolerance(
     lines = [densify(x, order) for x in pair]
     kept = [simplify(x, tolerance, least=order, most=max(order, MOST_VERTICES)) for x in lines]
     parameters = [_at(x, k) for x, k in zip(lines, kept, strict=True)]
-    knots = [_averaging_knots(t, order) for t in parameters]
+    knots = [knots_by_averaging(t, order) for t in parameters]
     inner = [t[order:-order] for t in knots]
     few, many = (0, 1) if len(inner[0]) <= len(inner[1]) else (1, 0)
-    inner[few][:] = _snapped(inner[few], inner[many])
+    inner[few][:] = _matched(inner[few], inner[many])
     missing = [np.setdiff1d(inner[1], inner[0]), np.setdiff1d(inner[0], inner[1])]
     return [_start(*x) for x in zip(lines, kept, parameters, knots, missing, strict=True)]
 
@@ -44,7 +45,7 @@ def starts_by_count(
     lines = [densify(x, count) for x in pair]
     kept = [simplify(x, flat, least=count, most=count, spread=SPREAD) for x in lines]
     common = np.mean([_at(x, k) for x, k in zip(lines, kept, strict=True)], axis=0)
-    knots = _averaging_knots(common, order)
+    knots = knots_by_averaging(common, order)
     return [_start(x, k, common, knots, knots[:0]) for x, k in zip(lines, kept, strict=True)]
 
 
@@ -53,15 +54,7 @@ def _at(line: np.ndarray, kept: np.ndarray) -> np.ndarray:
     return arc[kept] / arc[-1]
 
 
-def _averaging_knots(parameters: np.ndarray, order: int) -> np.ndarray:
-    """Equation (5) in NumPy: curves of every new size would compile the JAX version again."""
-    inner = parameters[:0]
-    if len(parameters) > order:
-        inner = np.convolve(parameters[1:-1], np.full(order - 1, 1 / (order - 1)), mode="valid")
-    return np.concatenate([np.zeros(order), inner, np.ones(order)])
-
-
-def _snapped(knots: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def _matched(knots: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """`knots` with each moved onto a target within reach: nearest pairs first, one to one."""
     reach = min(SNAP, 0.5 / (len(targets) + 1))
     moved = knots.copy()

@@ -5,19 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit._base._host_splines import basis_matrix
+
 GROSS = 20.0  # times the median residual: where a point has half its weight
 LEAST = 1e-9  # of the diagonal: a residual this small is rounding
 SPECK = 1e-13  # of the mean diagonal entry
 
 
-def collocation(knots: Float[Any, " knots"], order: int, u: Float[Any, " points"]) -> Any:
-    """Sparse matrix (points, control points) of the basis functions at `u`, within the domain."""
-    from scipy.interpolate import BSpline
-
-    return BSpline.design_matrix(u, knots, order - 1)
-
-
-def tensor_rows(first: Any, second: Any) -> Any:
+def _tensor_rows(first: Any, second: Any) -> Any:
     """Row k is the Kronecker product of row k of each: sparse (points, columns x columns)."""
     from scipy.sparse import csr_array
 
@@ -31,34 +26,24 @@ def tensor_rows(first: Any, second: Any) -> Any:
     return csr_array((values.ravel(), columns.ravel(), rows), shape=shape)
 
 
-def thin_plate(knots: tuple[np.ndarray, np.ndarray], order: tuple[int, int]) -> Any:
+def _thin_plate_matrix(knots: tuple[np.ndarray, np.ndarray], order: tuple[int, int]) -> Any:
     r"""Sparse matrix of $\int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2$ (10), index i nv + j."""
     from scipy.sparse import kron
 
-    u, v = (_products(t, k) for t, k in zip(knots, order, strict=True))
+    u, v = (_derivative_products(t, k) for t, k in zip(knots, order, strict=True))
     return (kron(u[2], v[0]) + 2 * kron(u[1], v[1]) + kron(u[0], v[2])).tocsr()
 
 
-def _products(knots: np.ndarray, order: int) -> list[Any]:
+def _derivative_products(knots: np.ndarray, order: int) -> list[Any]:
     """Integrals of products of the basis functions, and of their first and second derivatives."""
-    from scipy.interpolate import BSpline
-    from scipy.sparse import csr_array, diags_array
+    from scipy.sparse import csr_array
 
     nodes, weights = np.polynomial.legendre.leggauss(order)  # exact for the degree
     breaks = np.unique(knots)
-    half, middle = np.diff(breaks) / 2, (breaks[1:] + breaks[:-1]) / 2
-    at = (middle[:, None] + half[:, None] * nodes).ravel()
-    scale = diags_array((half[:, None] * weights).ravel())
-    count = len(knots) - order
-    found = []
-    for derivative in range(3):
-        if derivative >= order:
-            found.append(csr_array((count, count)))
-            continue
-        basis = BSpline(knots, np.eye(count), order - 1)
-        values = csr_array(basis(at, derivative))
-        found.append(values.T @ scale @ values)
-    return found
+    half, middle = np.diff(breaks)[:, None] / 2, (breaks[1:] + breaks[:-1])[:, None] / 2
+    at, root = (middle + half * nodes).ravel(), np.sqrt(half * weights).reshape(-1, 1)
+    rows = [csr_array(root * basis_matrix(knots, order, at, derivative)) for derivative in range(3)]
+    return [x.T @ x for x in rows]
 
 
 def robust_held_fit(
@@ -76,8 +61,10 @@ def robust_held_fit(
     over that of the second. With `smoothing` > 0 there is one solution whatever the points. The weights
     are 1 at first, and fall with the residual over its median in each of the `rounds`.
     """
-    parts = [collocation(t, k, x) for t, k, x in zip(knots, order, places.T, strict=True)]
-    rows, plate = tensor_rows(*parts), thin_plate(knots, order)
+    from scipy.interpolate import BSpline
+
+    parts = [BSpline.design_matrix(x, t, k - 1) for t, k, x in zip(knots, order, places.T, strict=True)]
+    rows, plate = _tensor_rows(*parts), _thin_plate_matrix(knots, order)
     weights = np.ones(len(points))
     net = _held_solution(border, rows, plate, points, weights, smoothing)
     for _ in range(rounds):

@@ -4,14 +4,12 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._cloud import Cloud
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae
+from jaxfit._base._host_splines import Knots
+from jaxfit._base._normalised_cloud import Cloud
 from jaxfit._checks import check_kind
-
-Knots = tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]]
 
 
 class AbstractBaseMethod(eqx.Module):
@@ -29,30 +27,28 @@ class AbstractBaseMethod(eqx.Module):
 
 
 class Coons(eqx.Module):
-    """The Coons surface of the boundary itself; it does not look at the points.
+    """The Coons surface of the boundary itself, equations (6)-(7); it does not look at the points.
 
-    `abscissae`: `Greville()` (default) or `Uniform()`, as in `coons_surface`.
+    Parameters
+    ----------
+    abscissae : Greville() or Uniform()
+        Default `Greville()`; see `coons_surface`.
+
+    Raises
+    ------
+    TypeError
+        If `abscissae` is neither.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5), indexing="ij")
+    >>> boundary = jf.Boundary.from_grid(np.stack([x, y, x * y], axis=2))
+    >>> x, y, z = jf.base_surface(boundary, net=(4, 4), method=jf.Coons())(0.5, 0.5).tolist()
+    >>> abs(z - x * y) < 0.01
+    True
     """
 
     abscissae: AbstractAbscissae = GREVILLE
 
     def __check_init__(self) -> None:
         check_kind("abscissae", self.abscissae, AbstractAbscissae, "Greville()")
-
-
-def refined(
-    net: np.ndarray, knots: np.ndarray, order: int, axis: int, wanted: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Net and knots after halving the widest spans until there are `wanted` control points along an axis.
-
-    Exact: the surface stays.
-    """
-    from scipy.interpolate import BSpline
-
-    curve = BSpline(knots, np.moveaxis(net, axis, 0), order - 1)
-    while len(curve.t) - order < wanted:
-        widths = np.diff(curve.t)
-        widest = int(np.argmax(widths > widths.max() * (1 - 1e-9)))
-        curve = curve.insert_knot((curve.t[widest] + curve.t[widest + 1]) / 2)
-    count = len(curve.t) - order
-    return np.moveaxis(curve.c[:count], 0, axis), curve.t

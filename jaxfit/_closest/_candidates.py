@@ -1,9 +1,9 @@
-"""The search for rivals: every sample that could lead to a nearer foot than the one found, on the host.
+"""The search for candidates: every sample that could lead to a nearer foot than the one found, on the host.
 
-A foot at distance d can have a nearer rival elsewhere only if the sample next to the rival, at most half a
-spacing (a, b) away, is close enough: the residual e of the rival is orthogonal to the tangents (along a
+A foot at distance d can have a nearer one elsewhere only if the sample next to that one, at most half a
+spacing (a, b) away, is close enough: the residual e of the nearer foot is orthogonal to the tangents (along a
 crease or border, to the one that matters, for samples lie on those), so the squared distance of that sample
-exceeds the rival's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components
+exceeds the foot's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv b^2|, normal components
 only. Every sample this close that is not beside a foot already found is a start.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._closest._seeds import Samples
+from jaxfit._closest._samples import Samples
 
 WIDER = 1.5  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
@@ -25,29 +25,30 @@ LEAF = 32  # samples; the tree's own default is slower here
 
 
 class Search:
-    """The samples around every point, and which of them are still to be tried."""
+    """The samples of a surface, and which of them are still to be tried for a point."""
 
-    def __init__(self, samples: Samples, points: Float[np.ndarray, "points d"]):
+    def __init__(self, samples: Samples):
         from scipy.spatial import KDTree
 
         cloud = np.asarray(samples.points, np.float64)
         self.cloud = cloud.reshape(-1, cloud.shape[-1])
-        self.slack, self.sag = (np.ravel(x) for x in (samples.slack, samples.sag))
+        self.step_bound, self.curvature_bound = (
+            np.ravel(x) for x in (samples.step_bound, samples.curvature_bound)
+        )
+        self.most = self.step_bound.max(), self.curvature_bound.max()
         self.along_u = _Direction(samples.u, samples.stretch_u)
         self.along_v = _Direction(samples.v, samples.stretch_v)
         self.tree = KDTree(self.cloud, LEAF, balanced_tree=False, compact_nodes=False)
-        self.points = points
-        self.distance, self.index = self._query(slice(None), NEIGHBOURS[0])
 
-    def _query(self, which: Any, count: int, workers: int = -1) -> tuple[np.ndarray, np.ndarray]:
+    def _query(self, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         count = min(count, self.tree.n)
-        found = self.tree.query(self.points[which], k=count, workers=workers)
+        found = self.tree.query(points, k=count)
         distance, index = (np.ascontiguousarray(x.reshape(-1, count).T) for x in found)
         return distance, index
 
-    def nearest(self) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, points: Float[np.ndarray, "points d"]) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of the nearest sample of every point."""
-        return self.parameters(self.index[0])
+        return self.parameters(self.tree.query(points, workers=-1)[1])
 
     def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of samples given by number."""
@@ -68,28 +69,29 @@ class Search:
                 apart |= border[which] & direction.is_last(number)
         return apart
 
-    def rivals(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> "Rivals":
-        """The samples that may lead to a foot nearer than those at (u, v)."""
+    def candidates(
+        self, points: Float[np.ndarray, "points d"], u: np.ndarray, v: np.ndarray, distance: np.ndarray
+    ) -> "Candidates":
+        """The samples that may lead to a foot nearer to the points than those at (u, v)."""
         parts = [slice(begin, begin + BLOCK) for begin in range(0, len(distance), BLOCK)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            found = list(pool.map(lambda part: self._rivals_of(part, u, v, distance), parts))
+            found = list(pool.map(lambda part: self._candidates_of(part, points, u, v, distance), parts))
         who, sample = (np.concatenate(x) for x in zip(*found, strict=True))
-        return Rivals(self, who, sample)
+        return Candidates(self, points, who, sample)
 
-    def _rivals_of(
-        self, part: slice, u: np.ndarray, v: np.ndarray, distance: np.ndarray
+    def _candidates_of(
+        self, part: slice, points: np.ndarray, u: np.ndarray, v: np.ndarray, distance: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Of some points: so few that everything stays in the caches."""
         which = np.arange(len(distance))[part]
-        near, index = self.distance[:, part], self.index[:, part]
         who, sample = [], []
-        steps: tuple[Any, ...] = (*NEIGHBOURS[1:], None)
-        for more in steps:
-            reach, slack, sag = distance[which], self.slack[index], self.sag[index]
-            open_ = near**2 <= reach**2 + slack + reach * sag
+        for count, is_last in ((x, x == NEIGHBOURS[-1]) for x in NEIGHBOURS):
+            near, index = self._query(points[which], count)
+            reach, step, bent = distance[which], self.step_bound[index], self.curvature_bound[index]
+            open_ = near**2 <= reach**2 + step + reach * bent
             crowded = np.zeros(len(which), bool)
-            if near.shape[0] < self.tree.n and more is not None:
-                crowded = self._is_crowded(near[-1], reach, slack, sag)
+            if near.shape[0] < self.tree.n and not is_last:
+                crowded = self._is_crowded(near[-1], reach, step, bent)
                 open_ &= ~crowded
             row, column = np.nonzero(open_)
             there = index[row, column]
@@ -99,31 +101,31 @@ class Search:
             which = which[crowded]
             if not which.size:
                 break
-            near, index = self._query(which, more, workers=1)
         return np.concatenate(who), np.concatenate(sample)
 
     def _is_crowded(
-        self, last: np.ndarray, reach: np.ndarray, slack: np.ndarray, sag: np.ndarray
+        self, last: np.ndarray, reach: np.ndarray, step: np.ndarray, bent: np.ndarray
     ) -> np.ndarray:
-        """Where samples farther than the last may matter, having at most WIDER times the slack of these."""
-        wide = np.minimum(self.slack.max(), WIDER * slack.max(axis=0))
-        return last**2 <= reach**2 + wide + reach * np.minimum(self.sag.max(), WIDER * sag.max(axis=0))
+        """Where samples farther than the last may matter, having at most WIDER times the bounds of these."""
+        most_step, most_bent = self.most
+        wide = np.minimum(most_step, WIDER * step.max(axis=0))
+        return last**2 <= reach**2 + wide + reach * np.minimum(most_bent, WIDER * bent.max(axis=0))
 
-    def is_valley(self, who: np.ndarray, sample: np.ndarray) -> np.ndarray:
-        """Whether none of the eight samples around `sample` is nearer to the point `who`.
+    def is_local_minimum(self, point: np.ndarray, sample: np.ndarray) -> np.ndarray:
+        """Whether none of the eight samples around `sample` is nearer to the point.
 
-        Only samples of the same smooth stretch count: a valley may end at a crease.
+        Only samples of the same smooth stretch count: a local minimum may lie at a crease.
         """
         a, b = self.along_u.u.size, self.along_v.u.size
         row, column = np.divmod(sample, b)
-        here = np.sum((self.cloud[sample] - self.points[who]) ** 2, axis=1)
-        low = np.ones(len(who), bool)
+        here = np.sum((self.cloud[sample] - point) ** 2, axis=1)
+        low = np.ones(len(sample), bool)
         for i, j in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
             next_row, next_column = np.clip(row + i, 0, a - 1), np.clip(column + j, 0, b - 1)
             beside = self.cloud[next_row * b + next_column]
             apart = self.along_u.stretch[next_row] != self.along_u.stretch[row]
             apart |= self.along_v.stretch[next_column] != self.along_v.stretch[column]
-            low &= apart | (here <= np.sum((beside - self.points[who]) ** 2, axis=1))
+            low &= apart | (here <= np.sum((beside - point) ** 2, axis=1))
         return low
 
 
@@ -154,19 +156,19 @@ class _Direction:
         return apart
 
 
-class Rivals:
+class Candidates:
     """Pairs (point, sample) still to be tried, grouped by point, the most promising first."""
 
-    def __init__(self, search: Search, who: np.ndarray, sample: np.ndarray):
+    def __init__(self, search: Search, points: np.ndarray, who: np.ndarray, sample: np.ndarray):
         self.search, self.who, self.sample = search, who, sample
-        # Valleys of the samples first, and of the rest, which should lead to the same feet, only a few.
-        flank = ~search.is_valley(self.who, self.sample)
-        order = np.lexsort((flank, self.who))
+        # Local minima among the samples first; of the rest, which should lead to the same feet, only a few.
+        off_minimum = ~search.is_local_minimum(points[who], self.sample)
+        order = np.lexsort((off_minimum, self.who))
         self._keep(order)
-        flank = flank[order]
-        before = np.cumsum(flank) - flank
+        off_minimum = off_minimum[order]
+        before = np.cumsum(off_minimum) - off_minimum
         first = np.searchsorted(self.who, self.who)
-        self._keep(~flank | (before - before[first] < LEAST_STARTS))
+        self._keep(~off_minimum | (before - before[first] < LEAST_STARTS))
 
     def _keep(self, which: np.ndarray) -> None:
         self.who, self.sample = self.who[which], self.sample[which]

@@ -1,0 +1,250 @@
+"""Nearest feet of concrete points: padded to common sizes, and searched for where nothing is proven."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._cells import values_at
+from jaxfit._closest._candidates import Search
+from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._project import project
+from jaxfit._closest._reach import Reach
+from jaxfit._closest._samples import sample
+from jaxfit._precision import bucket
+from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+
+CHUNK = 1 << 16
+FEW = 1 << 13  # points at a time where most feet are known
+# The reach costs about as much as the search for so many points a cell.
+LEAST_POINTS_PER_CELL = 0.5
+HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
+
+
+def nearest_feet(
+    method: AbstractFootMethod,
+    net: Float[Any, "nu nv d"],
+    axis_u: Axis,
+    axis_v: Axis,
+    points: Float[np.ndarray, "points d"],
+    *,
+    start: tuple[Any, Any] | None = None,
+    known: tuple[Any, Any, Any, Any] | None = None,
+    tolerance: float,
+    max_steps: int,
+    used: tuple[int, int] | None = None,
+) -> HostFeet:
+    """Feet of all points: `u`, `v`, `f` (squared distance), `converged`, `steps`, and `point` on the surface.
+
+    From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: points whose
+    foot is below the reach of the surface are done, and the others are searched for. `known` are feet (u, v,
+    distance, converged) found before, with which the search begins; `point` is then left out. `tolerance` is
+    a fraction of the extent. Of a net with surplus control points, behind repeated end knots, `used` says
+    how many are in use along u and v.
+    """
+    projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, known is not None)
+    if start is not None:
+        best = projector(None, *start)
+    else:
+        best = _globally(projector, known, used or net.shape[:2])
+    lost = np.flatnonzero(~best["converged"])
+    if lost.size:
+        best = {name: np.array(x) for name, x in best.items()}
+        take_nearer(best, lost, projector(lost, best["u"][lost], best["v"][lost], borders=True))
+    if "point" in best:
+        best["point"] = best["point"].T + projector.centre.astype(net.dtype)[None, :]
+    return best
+
+
+@partial(jax.jit, static_argnames=("method",))
+def _run(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Array,
+    u: Array,
+    v: Array,
+    idle: Array,
+    tolerance: Array,
+    max_steps: Array,
+    borders: Array,
+) -> dict[str, Array]:
+    feet = project(method, pieces, target, u, v, tolerance, max_steps, idle, borders)
+    return {
+        "u": feet.best_u,
+        "v": feet.best_v,
+        "f": feet.best,
+        "converged": feet.converged,
+        "steps": feet.steps,
+        "point": values_at(pieces, feet.best_u, feet.best_v),
+    }
+
+
+class _Projector:
+    """Local feet of some of the points from starts, always in the same shapes."""
+
+    def __init__(
+        self,
+        method: AbstractFootMethod,
+        net: Any,
+        axes: tuple[Axis, Axis],
+        points: np.ndarray,
+        tolerance: float,
+        max_steps: int,
+        few: bool,
+    ):
+        self.method, self.axes, self.dtype = method, axes, np.dtype(net.dtype)
+        net = np.asarray(net, np.float64)
+        self.centre = _middle(net)
+        self.net = net - self.centre
+        self.centred = np.empty(points.shape[::-1])
+        np.subtract(points.T, self.centre[:, None], out=self.centred)
+        self.size = chunk_size(min(len(points), FEW) if few else len(points))
+        extent = self.dtype.type(tolerance * _extent(self.net, self.centred))
+        self.limits = extent, np.int32(max_steps)
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """The surface, made only if there is anything to project."""
+        return jax.device_put(pieces_on(self.net.astype(self.dtype), *self.axes))
+
+    def __call__(self, which: Any, u: Any, v: Any, borders: bool = False) -> HostFeet:
+        """Feet of the points `which` (None: all) from (u, v)."""
+        self.pieces  # noqa: B018 (before there are threads)
+        chosen = self.centred if which is None else self.centred[:, which]
+        one = partial(self._feet_of_chunk, np.asarray(borders))
+        return in_chunks(one, (chosen, np.asarray(u), np.asarray(v)), self.size)
+
+    def _feet_of_chunk(self, borders: np.ndarray, *inputs: np.ndarray) -> dict[str, Array]:
+        idle = np.arange(self.size) >= inputs[0].shape[-1]
+        inputs = tuple(padded(x, self.size).astype(self.dtype, copy=False) for x in inputs)
+        return _run(self.method, self.pieces, *inputs, idle, *self.limits, borders)
+
+
+def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostFeet:
+    """The nearest foot of all."""
+    net = projector.net[: used[0], : used[1]]
+    axes = [_in_use(axis, count) for axis, count in zip(projector.axes, used, strict=True)]
+    points = projector.centred.T
+    search = None
+    if known is None:
+        search = Search(sample(net.astype(projector.dtype), *axes))
+        best = projector(None, *search.nearest(points))
+        best = {name: np.array(x) for name, x in best.items()}
+        left = np.arange(len(points))
+    else:
+        names = ("u", "v", "distance", "converged")
+        best = {name: np.array(x) for name, x in zip(names, known, strict=True)}
+        best |= {"f": best.pop("distance") ** 2, "steps": np.zeros(len(points), np.int32)}
+        left = np.flatnonzero(~best["converged"])
+        if left.size:
+            search = Search(sample(net.astype(projector.dtype), *axes))
+            take_nearer(best, left, projector(left, *search.nearest(points[left])))
+        left = np.arange(len(points))
+    is_surface_in_space = net.shape[2] == 3 and axes[1].polynomials.shape[1] > 1
+    if is_surface_in_space and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
+        proven = Reach(net, *axes).proves(best["u"], best["v"], np.sqrt(best["f"]))
+        left = np.flatnonzero(~(proven & best["converged"]))
+    if left.size:
+        search = search or Search(sample(net.astype(projector.dtype), *axes))
+        _try_candidates(projector, search, left, best)
+    return best
+
+
+def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, best: HostFeet) -> None:
+    """Start from every sample that may lead to a nearer foot of the points `left`."""
+    distance = np.sqrt(best["f"][left].astype(np.float64))
+    points = np.ascontiguousarray(projector.centred.T[left])
+    candidates = search.candidates(points, best["u"][left], best["v"][left], distance)
+    size = projector.size
+    if len(candidates.who) > size:  # so many that it pays to drop those next to feet found first
+        which, u, v = candidates.first()
+        other = projector(left[which], u, v)
+        everywhere_u, everywhere_v = best["u"][left], best["v"][left]
+        everywhere_u[which], everywhere_v[which] = other["u"], other["v"]
+        candidates.found(everywhere_u, everywhere_v)
+        take_nearer(best, left[which], other)
+    which, u, v = candidates.rest()
+    for begin in range(0, which.size, CHUNK):
+        part = slice(begin, begin + CHUNK)
+        chosen = left[which[part]]
+        take_nearer(best, chosen, projector(chosen, u[part], v[part]))
+
+
+def _in_use(axis: Axis, count: int) -> Axis:
+    """The cells of the first `count` control points."""
+    width = axis.polynomials.shape[1]
+    cells = count - width + 1
+    if cells == axis.cells:
+        return axis
+    last = np.int32(cells - 1)
+    numbers = {
+        name: np.minimum(getattr(axis, name)[:cells], last) for name in ("first", "last", "before", "after")
+    }
+    return Axis(
+        breaks=axis.breaks[: cells + 1],
+        bounds=axis.bounds[:, :cells],
+        ends=np.minimum(axis.ends, last),
+        polynomials=axis.polynomials[:cells],
+        creased=axis.creased,
+        **numbers,
+    )
+
+
+def chunk_size(count: int) -> int:
+    """The padded size that clouds are cut into: chunks keep the CPU's cores busy and memory in its caches."""
+    most = CHUNK if jax.default_backend() == "cpu" else count
+    return bucket(-(-count // -(-count // most)))
+
+
+def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostFeet:
+    """`function` of arrays cut along their last axis, a thread for each core, the results put together."""
+    count = arrays[0].shape[-1]
+    parts = [slice(begin, min(begin + size, count)) for begin in range(0, count, size)]
+
+    def one(part: slice) -> HostFeet:
+        found = function(*(x[..., part] for x in arrays))
+        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in found.items()}
+
+    if len(parts) == 1:
+        return one(parts[0])
+    with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
+        pieces = list(pool.map(one, parts))
+    return {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
+
+
+def _middle(net: np.ndarray) -> np.ndarray:
+    """Centre of the box around the net, about which coordinates carry the least rounding."""
+    return 0.5 * (net.min(axis=(0, 1)) + net.max(axis=(0, 1)))
+
+
+def _extent(net: np.ndarray, centred: np.ndarray) -> float:
+    """Diagonal of the box around control points and queries."""
+    low = np.minimum(net.min(axis=(0, 1)), centred.min(axis=1))
+    high = np.maximum(net.max(axis=(0, 1)), centred.max(axis=1))
+    return float(np.linalg.norm(high - low))
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """The last axis filled up to `size` with its last entry."""
+    filling = size - x.shape[-1]
+    if not filling:
+        return x
+    return np.concatenate([x, np.repeat(x[..., -1:], filling, axis=-1)], axis=-1)
+
+
+def take_nearer(best: HostFeet, which: np.ndarray, other: HostFeet) -> None:
+    """Replace feet by nearer ones; `which` may name a point several times."""
+    np.add.at(best["steps"], which, other["steps"])
+    # Of each point's, the converged ones first and of these the nearest.
+    order = np.lexsort((other["f"], ~other["converged"], which))
+    first = order[np.unique(which[order], return_index=True)[1]]
+    mine = which[first]
+    nearer = other["f"][first] < best["f"][mine]
+    nearer &= other["converged"][first] | ~best["converged"][mine]
+    for name in best.keys() - {"steps"}:
+        best[name][..., mine[nearer]] = other[name][..., first[nearer]]

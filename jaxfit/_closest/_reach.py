@@ -1,0 +1,166 @@
+"""A bound below which a foot is certain to be the nearest: the reach of the surface, sample by sample.
+
+Let p be a foot of q at the distance d, and p + x another point of the surface. It is nearer to q only if
+|x|^2 < 2 (q - p).x, and q - p is normal to the surface (on a border it may point outwards too), so only if
+
+    d > |x|^2 / (2 |x_n|),      x_n the normal part of x.
+
+The least of these over all x is the reach at p (Federer 1959): up to it no foot is any but the nearest. It
+is taken over pairs of neighbouring samples. Farther ones are at least a radius R away, which alone gives
+R / 2.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit._closest._samples import grid_jet
+from jaxfit._splines._pieces import Axis
+
+SAFETY = 0.3  # of the reach, which is sampled
+PER_CELL = 2  # samples in each direction
+NEIGHBOURS = 33  # samples around one, itself included
+ADJACENT = 2  # samples so close along both parameters show the curvature
+# How far, in samples along each direction, two points of the surface may move against the samples beside.
+# In one plane it is 1/2, for each of the four samples around a foot has its pairs.
+MOVE = 0.7
+OUTERMOST = 4  # of the neighbours
+ROUNDING = 1e-6  # of a squared length
+LEAF = 16  # samples
+BLOCK = 512  # samples
+
+
+class Reach:
+    """The reach between samples of a surface in space, as far as the distances of some feet ask for it."""
+
+    def __init__(self, net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis):
+        from scipy.spatial import KDTree
+
+        self.axes = axis_u, axis_v
+        along = [_parameters(axis) for axis in self.axes]
+        (u, cell_u), (v, cell_v) = along
+        jet: Any = grid_jet(net, self.axes, (u, v), (cell_u, cell_v), 1)
+        points, du, dv = (
+            np.ascontiguousarray(jet[:, i, j].transpose(1, 0, 2)) for i, j in ((0, 0), (1, 0), (0, 1))
+        )
+        du, dv = (2.0 / PER_CELL) * du, (2.0 / PER_CELL) * dv  # of a sample
+        self.shape = points.shape[1:]
+        self.diagonal = _diagonals(points).reshape(-1)
+        self.points, du, dv = (x.reshape(len(x), -1) for x in (points, du, dv))
+        E, F, G = (_dot(x, y) for x, y in ((du, du), (du, dv), (dv, dv)))
+        one = np.maximum(E * G - F * F, ROUNDING * E * G) + np.finfo(E.dtype).tiny
+        self.normal = np.cross(du, dv, axis=0) / np.sqrt(one)
+        self.tangents = du, dv
+        # A vector is x = s du + t dv + x_n, with s = x . dual_u and t = x . dual_v.
+        self.dual_u, self.dual_v = (G * du - F * dv) / one, (E * dv - F * du) / one
+        self.forms = E, F, G
+        self.tree = KDTree(self.points.T, LEAF, balanced_tree=False, compact_nodes=False)
+
+    def proves(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
+        """Whether the feet at (u, v), `distance` away from their points, are certain to be the nearest."""
+        a, b = self.shape
+        row, column = (
+            _interval(axis, x, count - 1) for axis, x, count in zip(self.axes, (u, v), (a, b), strict=True)
+        )
+        place = row * (b - 1) + column
+        asked = np.zeros((a - 1) * (b - 1), bool)
+        asked[place] = True
+        number = np.flatnonzero(_around(asked.reshape(a - 1, b - 1), np.logical_or, False))
+        parts = [number[begin : begin + BLOCK] for begin in range(0, number.size, BLOCK)]
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            found = list(pool.map(self._reach_at, parts))
+        reach = np.full(a * b, np.inf)
+        reach[number] = np.concatenate(found)
+        return distance <= _least_of_four(reach.reshape(a, b)).reshape(-1)[place]
+
+    def _reach_at(self, number: np.ndarray) -> Float[np.ndarray, " samples"]:
+        """The reach at samples: so few that everything stays in the caches."""
+        count = min(NEIGHBOURS, self.tree.n)
+        away, beside = self.tree.query(self.points.T[number], count)
+        away, beside = (np.ascontiguousarray(x.reshape(-1, count).T) for x in (away, beside))
+        x = [p[beside[1:]] - p[number] for p in self.points]
+        s, t = (_dot(x, dual[:, number]) for dual in (self.dual_u, self.dual_v))
+        E, F, G = (form[number] for form in self.forms)
+        normal = self.normal[:, number]
+        height = np.abs(_dot(x, normal))
+        close = self._are_close(number, beside[1:])
+        # Points of other parts of the surface are not where their samples are: each of these may move.
+        turned = MOVE * sum(
+            np.abs(_dot(tangent[:, beside[1:]], normal[:, None])) for tangent in self.tangents
+        )
+        s_left, t_left = (np.copysign(np.maximum(np.abs(y) - MOVE, 0), y) for y in (s, t))
+        along2 = np.maximum(E * s_left**2 + 2 * F * s_left * t_left + G * t_left**2, 0)
+        worst = np.clip(np.sqrt(along2), np.maximum(height - turned, 0), height + turned)
+        square = np.where(close, away[1:] ** 2, worst**2 + along2)
+        height = np.hypot(np.where(close, height, worst), self._outward_part(number, s, t))
+        reach = np.min(square / (2 * np.maximum(height, np.sqrt(ROUNDING) * away[1:])), axis=0)
+        if count < self.tree.n:
+            # Of the samples that are not among these, the nearest are like the last ones that are.
+            others = self.diagonal[beside[-OUTERMOST:]].max(axis=0)
+            radius = away[-1] - 0.5 * (self.diagonal[number] + others)
+            reach = np.minimum(reach, 0.5 * np.maximum(radius, 0) / SAFETY)
+        return SAFETY * reach
+
+    def _are_close(self, number: np.ndarray, beside: np.ndarray) -> Bool[np.ndarray, "neighbours samples"]:
+        """Whether at most ADJACENT samples apart along u and along v."""
+        width = np.int32(self.shape[1])
+        row, column = np.divmod(number.astype(np.int32), width)
+        there_row, there_column = np.divmod(beside.astype(np.int32), width)
+        return (np.abs(there_row - row) <= ADJACENT) & (np.abs(there_column - column) <= ADJACENT)
+
+    def _outward_part(self, number: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """How far vectors point out of the domain, at samples on its border."""
+        a, b = self.shape
+        row, column = np.divmod(number, b)
+        part = np.zeros_like(s)
+        for place, last, x, dual in ((row, a - 1, s, self.dual_u), (column, b - 1, t, self.dual_v)):
+            for side, sign in ((0, -1.0), (last, 1.0)):
+                at = np.flatnonzero(place == side)
+                length2 = np.maximum(_dot(dual[:, number[at]], dual[:, number[at]]), np.finfo(float).tiny)
+                part[:, at] += np.maximum(sign * x[:, at], 0) ** 2 / length2
+        return np.sqrt(part)
+
+
+def _parameters(axis: Axis) -> tuple[Any, np.ndarray]:
+    """Parameters of the samples and the cells they lie in; the last sample ends the last cell."""
+    first, last = axis.ends
+    cell = np.append(np.repeat(np.arange(first, last + 1), PER_CELL), last)
+    share = np.append(np.tile(np.arange(PER_CELL) / PER_CELL, last + 1 - first), 1.0)
+    return axis.centre[cell] + axis.half[cell] * (2.0 * share - 1.0), cell
+
+
+def _interval(axis: Axis, x: np.ndarray, count: int) -> np.ndarray:
+    """The number of the interval between samples, along one direction."""
+    first, last = axis.ends
+    knots = np.asarray(axis.breaks)[first : last + 2]
+    place = np.interp(x, knots, np.arange(knots.size, dtype=np.float64) * PER_CELL)
+    return np.minimum(place.astype(np.int32), count - 1)
+
+
+def _diagonals(points: Float[np.ndarray, "d a b"]) -> Float[np.ndarray, "a b"]:
+    """The longest diagonal of the rectangles around each sample."""
+    ways = (points[:, 1:, 1:] - points[:, :-1, :-1], points[:, 1:, :-1] - points[:, :-1, 1:])
+    longest = np.sqrt(np.maximum(*(_dot(x, x) for x in ways)))
+    return _around(longest, np.maximum, 0.0)
+
+
+def _around(rectangles: np.ndarray, combine: Any, outside: Any) -> np.ndarray:
+    """At every sample, the four rectangles around it combined."""
+    padded = np.pad(rectangles, 1, constant_values=outside)
+    both = combine(padded[1:], padded[:-1])
+    return combine(both[:, 1:], both[:, :-1])
+
+
+def _least_of_four(x: Float[np.ndarray, "a b"]) -> np.ndarray:
+    both = np.minimum(x[:-1], x[1:])
+    return np.minimum(both[:, :-1], both[:, 1:])
+
+
+def _dot(x: Any, y: Any) -> np.ndarray:
+    result = x[0] * y[0]
+    for k in range(1, len(x)):
+        result += x[k] * y[k]
+    return result

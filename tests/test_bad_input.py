@@ -1,0 +1,353 @@
+"""What would mislead a fit is refused in a sentence, before anything is computed or allocated."""
+
+import io
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
+
+import jaxfit as jf
+from jaxfit import _cli
+from jaxfit._checks import check_number
+from jaxfit._fit._problem import check_smoothing
+from jaxfit.io import InputError, read_points, read_surface, write_surface
+
+GRID = wavy_grid(8, 7)
+POINTS, EDGES = wavy_cloud(60)
+BOUNDARY = jf.Boundary(**EDGES)
+
+
+def sentence(error):
+    said = str(error.value)
+    assert "\n" not in said
+    assert said.endswith(".")
+    return said
+
+
+# ------------------------------------------------------------------ text files
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.csv", "1,5,2,0,3,1\n1,0,2,5,3,2\n1,1,2,2,3,3\n1,2,2,3,3,4\n"),
+        ("a.csv", "x,y,z\n1,5,2,0,3,1\n1,0,2,5,3,2\n1,1,2,2,3,3\n1,2,2,3,3,4\n"),
+        ("a.csv", "1,5,2,3,1\n1,0,2,5,3,2\n1,1,2,2,3,3\n1,2,2,3,3,4\n"),
+        ("a.csv", "1,5;2,0;3,1\n" * 4),
+        ("a.csv", "1,5 2,0 3,1\n" * 4),
+        ("a.xyz", "1,5 2,0 3,1\n" * 4),
+        ("a.txt", "1,5;2,0;3,1\n" * 4),
+        ("a.txt", "1,5\t-2,0\t3\n" * 4),
+    ],
+)
+def test_decimal_commas_are_refused(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=f"{name} seems to hold decimal commas") as error:
+        read_points(tmp_path / name)
+    assert "write decimals with points" in sentence(error)
+
+
+def test_named_columns_of_whole_numbers_are_no_decimal_commas(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,r,g,b\n1,5,2,0,3,1\n1,0,2,5,3,2\n1,1,2,2,3,3\n1,2,2,3,3,4\n")
+    np.testing.assert_array_equal(read_points(path).points, [[1, 5, 2], [1, 0, 2], [1, 1, 2], [1, 2, 2]])
+    path.write_text("1,5,2\n1,0,2\n1,1,2\n1,2,2\n")
+    assert read_points(path).points.shape == (4, 3)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("name", ["a.csv", "a.xyz"])
+def test_a_column_that_counts_the_points_is_refused(tmp_path, first, name):
+    delimiter = "," if name == "a.csv" else " "
+    numbered = np.column_stack([np.arange(first, first + 60), POINTS])
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="n,x,y,z", comments="")
+    with pytest.raises(InputError, match=f"{name}: the first column only counts the points") as error:
+        read_points(tmp_path / name)
+    assert "remove it" in sentence(error)
+    np.savetxt(tmp_path / name, numbered[:, [1, 2, 3, 0]], delimiter=delimiter)
+    np.testing.assert_array_equal(read_points(tmp_path / name).points, POINTS)
+
+
+# -------------------------------------------------------------------- archives
+
+
+def member(shape, dtype="<f8", content=b""):
+    """An array in NumPy's format that claims this shape and type."""
+    header = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content
+
+
+def archive(path, name, content, claimed=None):
+    """An .npz file with one member, which may claim to be larger than it is."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(name, content)
+    if claimed is not None:
+        whole = bytearray(path.read_bytes())
+        whole[22:26] = struct.pack("<I", claimed)
+        at = whole.index(b"PK\x01\x02")
+        whole[at + 24 : at + 28] = struct.pack("<I", claimed)
+        path.write_bytes(whole)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("suffix", "shape"), [(".npy", (10**12, 3)), (".npz", (10**12, 3)), (".npz", (10**8, 3))]
+)
+def test_nothing_is_allocated_for_what_a_file_only_claims(tmp_path, suffix, shape, monkeypatch, capsys):
+    path, content = tmp_path / f"a{suffix}", member(shape, content=bytes(240))
+    if suffix == ".npy":
+        path.write_bytes(content)
+    else:
+        archive(path, "points.npy", content, 24 * 10**8 + 128 if shape[0] == 10**8 else None)
+    monkeypatch.setattr(np, "fromfile", None)
+    with pytest.raises(InputError, match="is damaged"):
+        read_points(path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
+    assert _cli.main(["fit", f"a{suffix}", "-o", "s.npz", "--no-picture"]) == 2
+    assert f"a{suffix} is damaged" in capsys.readouterr().err
+
+
+def test_a_surface_that_only_claims_its_size_is_refused(tmp_path):
+    path = archive(tmp_path / "s.npz", "control_points.npy", member((10**12, 3)))
+    with pytest.raises(InputError, match="is damaged"):
+        read_surface(path)
+
+
+def test_members_need_no_suffix_but_must_be_arrays(tmp_path):
+    buffer = io.BytesIO()
+    np.save(buffer, POINTS)
+    path = archive(tmp_path / "a.npz", "points", buffer.getvalue())
+    np.testing.assert_array_equal(read_points(path).points, POINTS)
+    archive(path, "points", b"1 2 3\n" * 9)
+    with pytest.raises(InputError, match="is damaged, or holds something else"):
+        read_points(path)
+
+
+@pytest.mark.parametrize("dtype", [">f8", ">f4", ">i4"])
+def test_the_order_of_bytes_does_not_matter(tmp_path, dtype):
+    points = (1000 * POINTS).astype(dtype)
+    np.savez(tmp_path / "a.npz", points=points)
+    read = read_points(tmp_path / "a.npz").points
+    assert read.dtype.isnative
+    np.testing.assert_array_equal(read, points)
+    surface = wavy_surface()
+    np.savez(
+        tmp_path / "s.npz",
+        control_points=np.asarray(surface.control_points, ">f8"),
+        knots_u=np.asarray(surface.knots_u, ">f8"),
+        knots_v=np.asarray(surface.knots_v, ">f8"),
+    )
+    np.testing.assert_array_equal(read_surface(tmp_path / "s.npz").control_points, surface.control_points)
+
+
+@pytest.mark.parametrize("array", [np.zeros(8, "f8,f8,f8"), POINTS + 0j, POINTS.astype(object), POINTS > 0])
+def test_arrays_of_no_real_numbers_are_refused(tmp_path, array):
+    np.savez(tmp_path / "a.npz", points=array)
+    with pytest.raises(InputError, match=r"a\.npz") as error:
+        read_points(tmp_path / "a.npz")
+    sentence(error)
+
+
+# ------------------------------------------------------------------- arguments
+
+
+def masked(x, count=3):
+    mask = np.zeros(np.shape(x), bool)
+    mask.flat[:count] = True
+    return np.ma.array(x, mask=mask)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("points", lambda: jf.fit_points(masked(POINTS), BOUNDARY)),
+        ("points", lambda: jf.approximate(masked(POINTS), wavy_surface())),
+        ("points", lambda: jf.closest_point(wavy_surface(), masked(POINTS))),
+        ("weights", lambda: jf.fit_points(POINTS, BOUNDARY, weights=masked(np.ones(60)))),
+        (
+            "start u",
+            lambda: jf.approximate(POINTS, wavy_surface(), start=(masked(POINTS[:, 0]), POINTS[:, 1])),
+        ),
+        ("grid", lambda: jf.interpolate(masked(GRID))),
+        ("grid", lambda: jf.Boundary.from_grid(masked(GRID))),
+        ("normals", lambda: jf.interpolate(GRID, normals=masked(GRID))),
+        ("v1", lambda: jf.Boundary(**EDGES | {"v1": masked(EDGES["v1"])})),
+    ],
+)
+def test_masked_entries_are_refused(name, call):
+    with pytest.raises(ValueError, match=f"{name} must not be masked, but 3 of its") as error:
+        call()
+    sentence(error)
+
+
+@pytest.mark.parametrize("change", [np.ma.array, lambda x: x.astype(">f8")])
+def test_unset_masks_and_foreign_bytes_change_nothing(change):
+    plain, changed = (jf.Boundary.from_grid(x) for x in (GRID, change(GRID)))
+    np.testing.assert_array_equal(plain.v0, changed.v0)
+    us, vs = (jf.grid_parameters(x) for x in (GRID, change(GRID)))
+    np.testing.assert_array_equal(us[0], vs[0])
+
+
+NUMBERS = {
+    "tol_average and tol_maximum": lambda x: jf.fit_points(POINTS, BOUNDARY, tol_average=x),
+    "tolerance": lambda x: jf.interpolate(GRID, tolerance=x),
+    "scale": jf.GemanMcClure,
+    "foot_tolerance": lambda x: jf.GeometricApproximation(foot_tolerance=x),
+    "smoothing": lambda x: jf.StandardApproximation(smoothing=x),
+    "reach": lambda x: jf.OrthogonalDistance(reach=x),
+}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+def test_numbers_are_finite(name, value):
+    with pytest.raises(ValueError, match=f"{name} must be") as error:
+        NUMBERS[name](value)
+    sentence(error)
+
+
+@pytest.mark.parametrize("value", [True, np.True_, np.ones(1), "1", None])
+def test_switches_arrays_and_text_are_no_numbers(value):
+    with pytest.raises(TypeError, match="x must be a number, but is"):
+        check_number("x", value, 0.0)
+    with pytest.raises(ValueError, match="smoothing must be a finite number"):
+        check_smoothing(value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: jf.fit_points(POINTS + 1e14, BOUNDARY),
+        lambda: jf.approximate(POINTS + 1e14, wavy_surface()),
+        lambda: jf.interpolate(GRID + 1e14),
+        lambda: jf.interpolate(GRID + 1e14, jf.StandardInterpolation()),
+    ],
+)
+def test_points_below_their_own_rounding_are_refused(call):
+    with pytest.raises(
+        ValueError, match="must differ by more than the rounding of their coordinates"
+    ) as error:
+        call()
+    assert "subtract their centre" in sentence(error)
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        (POINTS + np.array([3.0, 0.0, 0.0]), "boundary lies 2"),
+        (POINTS - np.array([0.0, 1e4, 0.0]), "boundary lies 1e+04 away"),
+        (1000 * POINTS, "bounding box with the diagonal 1.4"),
+        (1e-3 * POINTS, "bounding box with the diagonal 1.4"),
+    ],
+)
+def test_a_boundary_elsewhere_is_refused(points, said):
+    for call in (jf.fit_points, lambda p, b: jf.base_surface(b, p)):
+        with pytest.raises(ValueError, match="same unit and frame") as error:
+            call(points, BOUNDARY)
+        assert said in sentence(error)
+
+
+def test_a_cloud_far_out_of_its_boundary_is_no_mistake():
+    bulge = POINTS * np.array([0.5, 0.5, 1.0]) + np.array([0.25, 0.25, 0.6])
+    assert jf.base_surface(BOUNDARY, bulge).dimension == 3
+
+
+# ------------------------------------------------------------ fits and surfaces
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return jf.interpolate(GRID)
+
+
+def test_a_fit_is_written_like_its_surface(tmp_path, fit):
+    write_surface(tmp_path / "s.npz", fit)
+    np.testing.assert_array_equal(read_surface(tmp_path / "s.npz").control_points, fit.surface.control_points)
+
+
+def test_a_printed_fit_tells_its_errors(fit):
+    for said in (
+        "8 x 7",
+        "4 x 4",
+        "interpolation",
+        " % of the diagonal",
+        "all tolerances are met",
+        "iterations",
+    ):
+        assert said in str(fit)
+    assert "\n" not in repr(fit)
+    assert "8 x 7 control points, average error" in repr(fit)
+
+
+def test_a_fit_without_values_prints_its_shapes(fit):
+    shapes = []
+    jax.eval_shape(lambda grid: shapes.append(str(jf.interpolate(grid))), GRID)
+    batch = jax.tree.map(lambda x: np.stack([x, x]), fit)
+    for said in (*shapes, str(batch), repr(jax.tree.map(lambda x: None, fit))):
+        assert said.startswith("Fit(")
+
+
+# ------------------------------------------------------------- the command line
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    np.savez(tmp_path / "grid.npz", grid=GRID)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
+    monkeypatch.setattr(jf, "interpolate", lambda *_, **__: pytest.fail("the fit has begun"))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["-o", "s.npz"], "s.png is a folder"),
+        (["-o", "t.npz", "--picture", "s.png"], "s.png is a folder"),
+        (["-o", "d.npz"], "d.npz is a folder"),
+        (["-o", "t.npz", "--picture", "none/p.png"], "does not exist; make it first"),
+        (["-o", "t.npz", "--max-steps", "2147483646"], "at most 1,000,000"),
+        (["-o", "t.npz", "--max-steps", "9" * 5000], "at most 1,000,000"),
+        (["-o", "t.npz", "--order", "9x4"], "order must be"),
+        (["-o", "t.npz", "--cache", "c", "--no-cache"], "not allowed with"),
+    ],
+)
+def test_bad_usage_is_noticed_before_the_fit(folder, monkeypatch, capsys, argv, said):
+    (folder / "s.png").mkdir()
+    (folder / "d.npz").mkdir()
+    if "order" in said:
+        monkeypatch.undo()
+        monkeypatch.chdir(folder)
+        monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
+    assert _cli.main(["fit", "grid.npz", *argv]) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err
+    assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("seconds", [0.3, 0.8, 1.4])
+def test_an_interrupted_command_is_quiet(tmp_path, seconds):
+    np.savez(tmp_path / "grid.npz", grid=GRID)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "jaxfit", "fit", "grid.npz", "-o", "s.npz", "--no-cache"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(seconds)
+    running.send_signal(signal.SIGINT)
+    output, error = running.communicate(timeout=60)
+    assert (running.returncode, output) == (130, "")
+    assert error in ("", "jaxfit: error: interrupted, nothing more is written.\n")
+    assert os.listdir(tmp_path) == ["grid.npz"]
