@@ -138,9 +138,10 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
-    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    @staticmethod
+    def check_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
         """None can be met."""
-        refuse_normals(self, normals)
+        refuse_normals("GeometricInterpolation", normals)
 
     def fit(self, problem: GridProblem, progress: Progress | None) -> Fit:
         """Parameters and knots, and the loop."""

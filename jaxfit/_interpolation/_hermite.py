@@ -73,7 +73,8 @@ class NormalInterpolation(AbstractDirectInterpolation):
         if self.normal_tolerance is not None:
             check_number("normal_tolerance", self.normal_tolerance, 0.0)
 
-    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    @staticmethod
+    def check_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
         """Unit vectors, one for each point of the grid."""
         return _checked_normals(normals, grid, order)
 

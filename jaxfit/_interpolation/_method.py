@@ -1,9 +1,10 @@
 """What an interpolation method is: given a grid in the problem's unit, it returns a fit."""
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,11 +14,19 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._history import ErrorHistory, History, public_history, without_counts
+from jaxfit._fit._history import (
+    LEAST_ENTRIES,
+    MOST_ENTRIES,
+    ErrorHistory,
+    History,
+    public_history,
+    without_counts,
+)
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit
 from jaxfit._fit._scaling import Outward
 from jaxfit._parameters import AbstractParametrisation, grid_parameters
+from jaxfit._precision import bucket
 from jaxfit._splines import BSplineSurface
 
 Pair = tuple[Any, Any]
@@ -40,7 +49,7 @@ class Frame(eqx.Module):
     max_steps: Int[Any, ""]
 
 
-class GridProblem(eqx.Module):
+class GridProblem(NamedTuple):
     """A grid to interpolate. Lengths are in the problem's unit, in which the diagonal is about 1."""
 
     data: Float[Any, "n m d"]
@@ -68,8 +77,9 @@ class Solution(eqx.Module):
 class AbstractInterpolation(eqx.Module):
     """A way to pass a surface through every point of a grid."""
 
+    @staticmethod
     @abstractmethod
-    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    def check_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
         """The normals that were given with `grid` (n, m, d), checked; raises where they cannot be met."""
 
     @abstractmethod
@@ -88,15 +98,14 @@ class AbstractDirectInterpolation(AbstractInterpolation):
 
     def fit(self, problem: GridProblem, progress: Progress | None) -> Fit:
         """Solve, and check what could not be checked before."""
-        data, frame = problem.data, problem.frame
-        history = ErrorHistory.empty(int(frame.max_steps), data.dtype)
-        entries = history.capacity
-        fit, extent = _compiled(self, entries, problem.order, data, problem.normals, frame)
+        data, order, frame = problem.data, problem.order, problem.frame
+        entries = min(bucket(int(frame.max_steps) + 1, LEAST_ENTRIES), MOST_ENTRIES)
+        fit, extent = _compiled(self, entries, order, data, problem.normals, frame)
         fit.stats["diagonal"] = problem.unit.diagonal
-        if is_concrete(fit):
-            check_solved(self.parametrisation, problem.order, data, extent, fit.maximum_error)
-            made = int(fit.stats["num_steps"]) + 1
-            fit = eqx.tree_at(lambda x: x.history, fit, _cut(fit.history, made))
+        if is_concrete(fit.maximum_error):
+            check_solved(self.parametrisation, order, data, extent, fit.maximum_error)
+            if fit.history.average.shape[0] > 1:
+                fit = dataclasses.replace(fit, history=_cut(fit.history, int(fit.stats["num_steps"]) + 1))
         return fit
 
 
@@ -167,12 +176,10 @@ def errors_only(history: ErrorHistory, steps: Any) -> History:
     return without_counts(public_history(history, steps))
 
 
-def refuse_normals(method: AbstractInterpolation, normals: Any) -> None:
+def refuse_normals(method: str, normals: Any) -> None:
     """Raise where normals are given to a method that does not meet them."""
     if normals is not None:
-        raise ValueError(
-            f"normals cannot be met by {type(method).__name__}; pass method=NormalInterpolation()."
-        )
+        raise ValueError(f"normals cannot be met by {method}; pass method=NormalInterpolation().")
 
 
 def extent_of(data: Float[Any, "n m d"]) -> Float[Array, "2"]:

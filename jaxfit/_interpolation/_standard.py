@@ -91,9 +91,10 @@ class StandardInterpolation(AbstractDirectInterpolation):
         """Whether more than the tensor product is to be solved."""
         return self.per_point or self.parameter_correction
 
-    def check_normals(self, normals: Any, grid: Any, order: tuple[int, int]) -> Any:
+    @staticmethod
+    def check_normals(normals: Any, grid: Any, order: tuple[int, int]) -> Any:
         """None can be met."""
-        refuse_normals(self, normals)
+        refuse_normals("StandardInterpolation", normals)
 
     def solve(self, problem: GridProblem, history: ErrorHistory) -> Solution:
         """The tensor product, and where asked the general system after it."""
