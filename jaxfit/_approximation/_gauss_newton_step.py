@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit._approximation._damping import within_reach
 from jaxfit._approximation._distance_rows import NormalEquations
-from jaxfit._normal_equations import Stencil, coupled_preconditioner, free_points, solve_coupled, thin_plate
-from jaxfit._splines._pieces import Axis
+from jaxfit._normal_equations import Stencil, ThinPlate, coupled_preconditioner, free_points, solve_coupled
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients
@@ -18,7 +17,7 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
 def gauss_newton_step(
-    axes: tuple[Axis, Axis],
+    plate: ThinPlate,
     smoothing: Any,
     reach: Any,
     correction_rhs: Callable[[Array, Array], Array],
@@ -32,7 +31,6 @@ def gauss_newton_step(
     `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
     damping 1 there is none.
     """
-    plate = thin_plate(*axes)
     stiffness = plate.stencil()
     matrix = equations.matrix.plus(stiffness, smoothing)
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.

@@ -20,7 +20,7 @@ from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._second_order import second_order_rhs
-from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
+from jaxfit._approximation._smoothing import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -31,15 +31,16 @@ from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import thin_plate
+from jaxfit._normal_equations import ThinPlate
 from jaxfit._splines._pieces import pieces_on
 
 
 class OrthogonalState(eqx.Module):
-    """lambda, and how steps are damped."""
+    """lambda, how steps are damped, and the thin plate."""
 
     smoothing: Float[Any, ""]
     damping: DampingState
+    plate: ThinPlate | None
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -156,9 +157,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, OrthogonalState]:
         """Undamped steps cannot fail, so the first is one."""
+        plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
-        dtype = problem.target.dtype
-        return surface, OrthogonalState(as_smoothing(self.smoothing, dtype), first_damping(surface, dtype))
+        smoothing = as_smoothing(self.smoothing, dtype)
+        return surface, OrthogonalState(smoothing, first_damping(surface, dtype), plate)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
         """Feet from the last accepted ones, and the energy of the surface."""
@@ -166,7 +168,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         here = measure_feet(
             self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
         )
-        energy = state.smoothing * thin_plate(*surface.axes).energy(surface.control_points)
+        energy = state.smoothing * plate_of(state.plate, surface).energy(surface.control_points)
         return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
@@ -192,7 +194,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
         projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
         rejected = state.rejected_steps + ~good
         judged = DampingState(surface, energy, state.predicted, damping, rejected)
-        return Iterate(surface, projection, OrthogonalState(new.state.smoothing, judged), new.step)
+        return Iterate(
+            surface, projection, OrthogonalState(new.state.smoothing, judged, new.state.plate), new.step
+        )
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """New knots, and a step to be judged once it has been measured."""
@@ -214,10 +218,16 @@ class OrthogonalDistance(AbstractIterativeMethod):
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
             return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
-        solve = partial(gauss_newton_step, axes, iterate.state.smoothing, self.reach, correction_rhs)
+        solve = partial(
+            gauss_newton_step,
+            plate_of(iterate.state.plate, surface),
+            iterate.state.smoothing,
+            self.reach,
+            correction_rhs,
+        )
         following, predicted = materialise(always, solve, equations, net, held, damping.damping)
         judged = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
-        state = OrthogonalState(iterate.state.smoothing, judged)
+        state = OrthogonalState(iterate.state.smoothing, judged, iterate.state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
     def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
@@ -234,7 +244,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ) -> tuple[Iterate, dict[str, Any]]:
         """lambda, the integral (10), and how the steps went."""
         state, surface = iterate.state, iterate.surface
-        energy = thin_plate(*surface.axes).energy(surface.control_points)
+        energy = plate_of(state.plate, surface).energy(surface.control_points)
         return iterate, {
             "smoothing": state.smoothing,
             "bending_energy": energy * problem.scale**2,

@@ -1,4 +1,4 @@
-"""lambda, the weight of the thin plate, as users give it."""
+"""The thin plate of a fit, and lambda, its weight."""
 
 from typing import Any
 
@@ -6,6 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit._checks import is_concrete
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._normal_equations import ThinPlate, thin_plate
 
 
 def check_smoothing(smoothing: Any) -> None:
@@ -21,6 +23,16 @@ def check_smoothing(smoothing: Any) -> None:
             f"smoothing must be a finite number of at least 0, but is {smoothing!r}; pass "
             "lambda, for instance 2e-5."
         )
+
+
+def constant_plate(insertion: Any, surface: WorkingSurface) -> ThinPlate | None:
+    """The thin plate of a surface that keeps its knots: computed once, not in every iteration."""
+    return thin_plate(*surface.axes) if insertion is None else None
+
+
+def plate_of(constant: ThinPlate | None, surface: WorkingSurface) -> ThinPlate:
+    """The thin plate of a surface, the `constant` one if there is one."""
+    return thin_plate(*surface.axes) if constant is None else constant
 
 
 def as_smoothing(smoothing: Any, dtype: Any) -> Any:

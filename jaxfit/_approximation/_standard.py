@@ -12,7 +12,7 @@ from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
-from jaxfit._approximation._smoothing import as_smoothing, check_smoothing
+from jaxfit._approximation._smoothing import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._cells import values_at
 from jaxfit._checks import check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -23,14 +23,15 @@ from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import RegularisedSystem, make_system, thin_plate
+from jaxfit._normal_equations import RegularisedSystem, ThinPlate, make_system
 
 
 class StandardState(eqx.Module):
-    """lambda, and by what share of its diagonal a singular matrix was shifted at most."""
+    """lambda, by what share of its diagonal a singular matrix was shifted at most, and the thin plate."""
 
     smoothing: Float[Any, ""]
     shift: Float[Any, ""]
+    plate: ThinPlate | None
 
 
 class StandardApproximation(AbstractIterativeMethod):
@@ -123,21 +124,27 @@ class StandardApproximation(AbstractIterativeMethod):
         else:
             smoothing = as_smoothing(self.smoothing, problem.target.dtype)
         xp: Any = np if is_concrete(problem, smoothing) else jnp
+        plate = constant_plate(self.insertion, surface)
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
-        return surface, StandardState(smoothing, xp.zeros_like(smoothing))
+        return surface, StandardState(smoothing, xp.zeros_like(smoothing), plate)
 
     def held(self, surface: WorkingSurface) -> Bool[Any, "nu nv"]:
         """Which control points stay."""
         return held_points(self.border, surface.control_points.shape, surface.used)
 
     def system(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection, smoothing: Any
+        self,
+        problem: Problem,
+        surface: WorkingSurface,
+        projection: Projection,
+        smoothing: Any,
+        plate: ThinPlate | None = None,
     ) -> RegularisedSystem:
         """The least-squares problem at the present parameters."""
         length = loss_length(self.loss, problem, projection.error)
         weight = reweighted(self.loss, length, problem.weight, projection.error)
         parameters = projection.u, projection.v
-        return make_system(surface.pieces, *parameters, problem.target, weight, smoothing)
+        return make_system(surface.pieces, *parameters, problem.target, weight, smoothing, plate)
 
     def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
         """New parameters, or the errors at the old ones."""
@@ -160,18 +167,18 @@ class StandardApproximation(AbstractIterativeMethod):
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """The net of least squares at the present parameters, and new knots."""
         surface, here, state = iterate.surface, iterate.projection, iterate.state
-        system = self.system(problem, surface, here, state.smoothing)
+        system = self.system(problem, surface, here, state.smoothing, state.plate)
         net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
         surface, step = surface.moved_to(net), iterate.step + 1
         if self.insertion is not None:
             surface = self.insertion(step, surface, here, problem.counted)
-        state = StandardState(state.smoothing, jnp.maximum(state.shift, shift))
+        state = StandardState(state.smoothing, jnp.maximum(state.shift, shift), state.plate)
         return Iterate(surface, here, state, step), history
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
         """lambda, the integral (10), and the largest shift."""
-        energy = thin_plate(*iterate.surface.axes).energy(iterate.surface.control_points)
+        energy = plate_of(iterate.state.plate, iterate.surface).energy(iterate.surface.control_points)
         stats = {"bending_energy": energy * problem.scale**2}
         return iterate, stats | {"smoothing": iterate.state.smoothing, "shift": iterate.state.shift}

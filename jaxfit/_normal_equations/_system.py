@@ -88,8 +88,11 @@ def make_system(
     target: Float[Any, "d points"],
     weight: Float[Any, " points"],
     smoothing: Float[Any, ""],
+    plate: ThinPlate | None = None,
 ) -> RegularisedSystem:
-    """Points with parameters (u, v) laid out on the cells of `pieces`, whose net does not matter."""
+    """Points with parameters (u, v) laid out on the cells of `pieces`, whose net does not matter; their thin
+    plate may be given.
+    """
     width = row_width(u.shape[0], pieces.cells)
     rows = rows_of(pieces, u, v, width, weight <= 0)
 
@@ -100,7 +103,7 @@ def make_system(
         return s, t, root, spread[3:]
 
     s, t, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], in_rows)
-    plate = thin_plate(pieces.axis_u, pieces.axis_v)
+    plate = thin_plate(pieces.axis_u, pieces.axis_v) if plate is None else plate
     return RegularisedSystem(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
 
 
