@@ -10,51 +10,6 @@ import pytest
 
 import jaxfit as jf
 
-WITHOUT_EXAMPLE = {
-    "Centripetal",
-    "Chebyshev",
-    "ChordLength",
-    "ClosestPoint",
-    "ConstantWeight",
-    "Discrepancy",
-    "Fairing",
-    "Fit",
-    "GaussNewton",
-    "GemanMcClure",
-    "GeneralizedCrossValidation",
-    "GeometricApproximation",
-    "GeometricInterpolation",
-    "History",
-    "HuWallner",
-    "Huber",
-    "ImplicitAdjoint",
-    "JaxoptGaussNewton",
-    "JaxoptLevenbergMarquardt",
-    "KnotInsertion",
-    "LevenbergMarquardt",
-    "Nesterov",
-    "Newton",
-    "NormalInterpolation",
-    "OptimalRepositioning",
-    "OrthogonalDistance",
-    "PointStatus",
-    "RESULTS",
-    "Reflection",
-    "Richardson",
-    "StandardApproximation",
-    "StandardInterpolation",
-    "Tukey",
-    "UnitWeights",
-    "UnrolledAdjoint",
-    "approximate",
-    "closest_point",
-    "curvature_energy",
-    "curve_parameters",
-    "fit_points",
-    "grid_parameters",
-    "interpolate",
-    "zebra",
-}
 PUBLIC = {
     name: value
     for name, value in vars(jf).items()
@@ -88,4 +43,4 @@ def test_examples_are_true(room):
             report = []
             doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
             assert not report, "".join(report)
-    assert set(without) == WITHOUT_EXAMPLE & set(names)
+    assert not without

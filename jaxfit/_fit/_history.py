@@ -88,6 +88,13 @@ class History(eqx.Module):
     -----
     The last 65,536 iterations are kept. Inside a transformation, where the number of iterations is not known,
     the arrays have room for more, and end in NaN.
+
+    Examples
+    --------
+    >>> errors, none = jnp.array([0.02, 0.005]), jnp.zeros(2)
+    >>> history = jf.History(average=errors, maximum=3 * errors, evaluations=none, change=none)
+    >>> round(float(history.average[0] / history.average[-1]), 3)
+    4.0
     """
 
     average: Float[Array, " steps"]

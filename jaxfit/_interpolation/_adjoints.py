@@ -31,6 +31,11 @@ class UnrolledAdjoint(AbstractAdjoint):
     moves_followed : int, optional
         Through how many moves; default as many as move feet, `freeze_after`, or 200 where feet are never
         held. Reverse mode runs each a second time and keeps one net for each.
+
+    Examples
+    --------
+    >>> jf.UnrolledAdjoint().moves(freeze_after=2), jf.UnrolledAdjoint(moves_followed=5).moves(freeze_after=2)
+    (2, 5)
     """
 
     moves_followed: int | None = None
@@ -48,6 +53,11 @@ class ImplicitAdjoint(AbstractAdjoint):
     Any parameters at which the surface meets the data solve the interpolation problem, so this is the
     derivative of a solution, though not of the one that the fit returns for other data. It is linear in the
     data and cheaper than `UnrolledAdjoint`.
+
+    Examples
+    --------
+    >>> jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint()).adjoint
+    ImplicitAdjoint()
     """
 
     def moves(self, freeze_after: int | None) -> None:

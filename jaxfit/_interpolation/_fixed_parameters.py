@@ -30,7 +30,13 @@ class AbstractAcceleration(eqx.Module):
 
 
 class Richardson(AbstractAcceleration):
-    """The iteration as it is."""
+    """The iteration as it is.
+
+    Examples
+    --------
+    >>> jf.GeometricInterpolation().acceleration
+    Richardson()
+    """
 
     needs_spectrum: ClassVar[bool] = False
 
@@ -54,6 +60,11 @@ class Chebyshev(AbstractAcceleration):
     ----------
     margin : float
         By how much the bounds, found at averaged parameters and with weights taken into account, are widened.
+
+    Examples
+    --------
+    >>> jf.GeometricInterpolation(acceleration=jf.Chebyshev()).acceleration
+    Chebyshev()
     """
 
     margin: float = 0.1

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
+from jaxfit._fit._feet import measure_grid, side_bounds
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_grid, side_bounds
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -103,12 +103,27 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         `stall_window` iterations, as it does at rounding level. It then returns the best surface whose
         closest points it has computed.
 
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    TypeError
+        If a field is of the wrong kind.
+
     Notes
     -----
+    Section 3 of Kineri, Wang, Lin and Maekawa (2012).
+
     It converges where the eigenvalues of the collocation matrix at the feet, times the weights, lie between
     0 and 2: fast for low orders, slowly from order 6 on. It may not where rows of the grid differ so much
     that averaged knots suit none of them, or where points repeat; `StandardInterpolation` always has a
     solution.
+
+    Examples
+    --------
+    >>> method = jf.GeometricInterpolation(acceleration=jf.Chebyshev())
+    >>> method.repositioning, method.freeze_after, method.parametrisation
+    (OptimalRepositioning(), 2, ChordLength())
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

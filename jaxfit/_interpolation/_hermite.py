@@ -63,6 +63,11 @@ class NormalInterpolation(AbstractDirectInterpolation):
 
     The extension announced at the end of Kineri, Wang, Lin and Maekawa (2012); Gofuku, Tamura and Maekawa
     (CAD 41, 2009) meet the normals of curves by iteration.
+
+    Examples
+    --------
+    >>> jf.NormalInterpolation(normal_tolerance=1e-3).parametrisation
+    ChordLength()
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

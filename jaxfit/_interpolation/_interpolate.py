@@ -77,6 +77,14 @@ def interpolate(
     surface and the feet have derivatives in the data, errors have none. On a closed grid (first row equal to
     the last) the feet stay on their side of the seam. With `symmetry`, fractions are of the diagonal of the
     data as given. A grid in single precision is fitted in double precision if the session has that.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, x * y], axis=2)
+    >>> fit = jf.interpolate(grid, jf.StandardInterpolation())
+    >>> fit.surface.shape, bool(fit.converged), fit.message
+    ((6, 5), True, 'all tolerances are met.')
     """
     check_order(order)
     check_steps("max_steps", max_steps)

@@ -71,6 +71,11 @@ class StandardInterpolation(AbstractDirectInterpolation):
 
     Source: section 2.2 of Kineri, Wang, Lin and Maekawa (2012); C. de Boor, A Practical Guide to Splines,
     chapter XIII, for the banded elimination.
+
+    Examples
+    --------
+    >>> jf.StandardInterpolation().iterative, jf.StandardInterpolation(per_point=True).iterative
+    (False, True)
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

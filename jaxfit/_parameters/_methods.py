@@ -18,6 +18,11 @@ class ChordLength(AbstractParametrisation):
     """Steps proportional to the distance itself: close to arc length on well sampled data.
 
     Source: paper section 2.2; NURBS Book eq. 9.5.
+
+    Examples
+    --------
+    >>> print(np.round(jf.curve_parameters(np.array([[0.0], [1.0], [5.0], [6.0]]), jf.ChordLength()), 3))
+    [0.    0.167 0.833 1.   ]
     """
 
     exponent: ClassVar[float] = 1.0
@@ -27,6 +32,11 @@ class Centripetal(AbstractParametrisation):
     """Steps proportional to the square root of the distance: calmer where spacing jumps.
 
     Source: paper section 2.2; E. T. Y. Lee, CAD 21 (1989); NURBS Book eq. 9.6.
+
+    Examples
+    --------
+    >>> print(np.round(jf.curve_parameters(np.array([[0.0], [1.0], [5.0], [6.0]]), jf.Centripetal()), 3))
+    [0.   0.25 0.75 1.  ]
     """
 
     exponent: ClassVar[float] = 0.5

@@ -57,6 +57,12 @@ class Reflection(eqx.Module):
     Works in any dimension and under `jit`, `vmap` and `grad`; first derivatives of a plane that is found
     are exact. Inside transformations values cannot be checked: where the plane is undetermined, its normal
     is then arbitrary, and finite.
+
+    Examples
+    --------
+    >>> mirror = jf.Reflection(point=[1.0, 0.0, 0.0], normal=[1.0, 0.0, 0.0])
+    >>> mirror.mirror(np.array([[3.0, 4.0, 5.0]])).tolist()
+    [[-1.0, 4.0, 5.0]]
     """
 
     axis: int = eqx.field(static=True)
