@@ -118,7 +118,7 @@ def _window_sum(net: Array, first_u: Array, first_v: Array, basis_u: Array, basi
     weights = (basis_u[:, None] * basis_v[None]).reshape(order_u * order_v, 1, *points)
     shifts = (nv * np.arange(order_u)[:, None] + np.arange(order_v)[None, :]).reshape(-1).astype(np.int32)
 
-    def add(total: Array, term: tuple[Array, Array]) -> tuple[Array, None]:
+    def add(total: Any, term: Any) -> tuple[Any, None]:
         shift, weight = term
         return total + weight * flat.at[:, first + shift].get(mode="promise_in_bounds"), None
 
