@@ -24,11 +24,6 @@ import helpers
 
 from jaxfit import BSplineSurface, HuWallner, Newton, closest_point
 from jaxfit._base import Boundary, base_surface
-from jaxfit._cells import values_at
-from jaxfit._closest import prepare
-from jaxfit._closest._project import project
-from jaxfit._closest._rivals import Search
-from jaxfit._splines._pieces import as_surface_arrays, make_axis
 
 BASES = {"blade_wrap_3000": (24, 40), "mannequin_head": (42, 42)}
 
@@ -87,40 +82,6 @@ def wavy(count, runs):
     on_device = jax.device_put((points, *start))
     *times, _ = timed(lambda: closest_point(surface, on_device[0], on_device[1:]), runs)
     line("wavy 42x42, warm, arrays on device", count, *times)
-    split(surface, points, start, runs)
-
-
-def split(surface, points, start, runs):
-    """The stages of the two calls, one by one (they do not add up exactly)."""
-    count = len(points)
-    net, *knots = as_surface_arrays(surface)
-    axes = [make_axis(x, order) for x, order in zip(knots, surface.order, strict=True)]
-    for sampled in (False, True):
-        *times, prepared = timed(lambda s=sampled: prepare(net, *axes, sampled=s), runs)
-        line(f"  prepare{', sampled' * sampled}", count, *times)
-    centred = points - np.asarray(prepared.centre)
-    target = jax.numpy.asarray(centred.T)
-    begin = tuple(jax.device_put(x) for x in start)
-    tolerance = jax.numpy.asarray(1e-12 * helpers.diagonal(net))
-    kernel = jax.jit(lambda q, u, v: project(Newton(), prepared.pieces, q, u, v, tolerance, np.int32(60)))
-    *times, feet = timed(lambda: kernel(target, *begin), runs)
-    line("  projection, warm", count, *times, f"{float(feet.steps.mean()):.1f} steps on average")
-    *times, search = timed(lambda: Search(prepared.samples, centred), runs)
-    line("  tree: building and querying", count, *times)
-    nearest = tuple(jax.device_put(x) for x in search.nearest())
-    *times, feet = timed(lambda: kernel(target, *nearest), runs)
-    line("  projection, cold", count, *times, f"{float(feet.steps.mean()):.1f} steps on average")
-    at = (np.asarray(feet.best_u), np.asarray(feet.best_v), np.sqrt(np.asarray(feet.best)))
-    *times, rivals = timed(lambda: search.rivals(*at), runs)
-    note = f"{len(rivals.who)} starts for {len(np.unique(rivals.who))} points"
-    line("  rivals: finding them", count, *times, note)
-    evaluate = jax.jit(values_at)
-    *times, _ = timed(lambda: evaluate(prepared.pieces, feet.best_u, feet.best_v), runs)
-    line("  points on the surface", count, *times)
-    *times, _ = timed(lambda: [np.array(x) for x in jax.tree.leaves(feet)], runs)
-    line("  transfer of the result", count, *times)
-    *times, _ = timed(lambda: jax.numpy.asarray(np.asarray(points - centred[0]).T), runs)
-    line("  transfer of the points", count, *times)
 
 
 def bases(folder, runs):

@@ -243,7 +243,7 @@ def test_points_below_their_own_rounding_are_refused(call):
 @pytest.mark.parametrize(
     ("points", "said"),
     [
-        (POINTS + np.array([3.0, 0.0, 0.0]), "boundary lies 2"),
+        (POINTS + np.array([5.0, 0.0, 0.0]), "boundary lies 4"),
         (POINTS - np.array([0.0, 1e4, 0.0]), "boundary lies 1e+04 away"),
         (1000 * POINTS, "bounding box with the diagonal 1.4"),
         (1e-3 * POINTS, "bounding box with the diagonal 1.4"),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxfit._cells import few_among, few_of, make_rows, row_width
+from jaxfit._cells import make_rows, overlap_add, powers, row_width
 
 POINTS, CELLS = 60, 9
 compiled = jax.jit(make_rows, static_argnums=(1, 2))
@@ -95,13 +95,20 @@ def test_rows_get_wider_with_more_points_in_a_cell():
 
 
 @pytest.mark.float32_too
-@pytest.mark.parametrize("points", [1, 31, 32, 77, 2000])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.2, 1.0])
-def test_few_points_are_the_first_of_those_marked(points, share):
-    mask = np.random.default_rng(points).uniform(size=points) < share
-    few = few_among(points)
-    number = np.asarray(jax.jit(few_of, static_argnums=1)(jnp.asarray(mask), few))
-    first = np.flatnonzero(mask)[:few]
-    assert number.shape == (few,)
-    np.testing.assert_array_equal(number[: len(first)], first)
-    assert (number[len(first) :] == points).all()
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7])
+def test_powers_are_those_of_numpy(count):
+    x = jnp.asarray(np.random.default_rng(count).uniform(-1, 1, (3, 5)))
+    expected = np.asarray(x)[None] ** np.arange(count)[:, None, None]
+    np.testing.assert_allclose(powers(x, count), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("axis", [0, 1, -1])
+def test_terms_overlap_one_place_farther_each(axis):
+    terms = np.random.default_rng(3).normal(size=(3, 4, 5, 2))
+    expected = 0.0
+    for place, term in enumerate(terms):
+        sides = [(0, 0)] * 3
+        sides[axis] = (place, 2 - place)
+        expected = expected + np.pad(term, sides)
+    np.testing.assert_allclose(overlap_add(terms, axis), expected, atol=1e-15)
+    np.testing.assert_allclose(overlap_add(jnp.asarray(terms), axis), expected, atol=1e-15)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
 from jaxfit._closest import _nearest_feet
+from jaxfit._splines._pieces import make_axis
 
 COUNT = 512  # one size for nearly all queries: few compilations
 
@@ -158,6 +159,27 @@ def test_a_long_thin_surface_and_coordinates_in_the_millions(wavy):
     moved = wavy.affine(np.diag([300.0, 300.0, 300.0]), np.array([5.1e5, 5.4e6, 100.0]))
     # Only nine digits are left below the diagonal; feet are as good as the coordinates are.
     assert_nearest(moved, queries(moved)[0])
+
+
+def test_known_feet_give_way_to_nearer_ones(wavy):
+    points, _, _ = queries(wavy)
+    cold = closest_point(wavy, points)
+    axes = [make_axis(np.asarray(knots), 4) for knots in (wavy.knots_u, wavy.knots_v)]
+    u, v, distance = (np.array(x) for x in (cold.u, cold.v, cold.distance))
+    found = np.arange(COUNT) % 7 > 0
+    u[~found], v[~found] = 0.5, 0.5  # not feet
+    distance[~found] = np.linalg.norm(points[~found] - np.asarray(wavy(0.5, 0.5)), axis=1)
+    feet = _nearest_feet.nearest_feet(
+        Newton(),
+        np.asarray(wavy.control_points),
+        *axes,
+        points,
+        known=(u, v, distance, found),
+        tolerance=1e-12,
+        max_steps=60,
+    )
+    assert feet["converged"].all()
+    np.testing.assert_allclose(np.sqrt(feet["f"]), cold.distance, rtol=0, atol=1e-12)
 
 
 def test_starts_near_the_feet_give_the_same_feet(wavy):

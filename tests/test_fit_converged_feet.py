@@ -7,10 +7,8 @@ import pytest
 from helpers import eps, random_surface, wavy_cloud, wavy_surface
 
 import jaxfit as jf
-from jaxfit._approximation._control_point_sums import _above_rounding, pull
-from jaxfit._approximation._foot_updates import Arrive
-from jaxfit._cells import KeptRows, cells_of
-from jaxfit._fit._problem import Problem
+from jaxfit._approximation._control_point_sums import ControlPointSums, _above_rounding
+from jaxfit._closest import update_feet
 from jaxfit._splines._pieces import make_pieces
 
 POINTS, EDGES = wavy_cloud(1500)
@@ -62,77 +60,81 @@ def test_starts_far_from_their_feet_are_left_to_the_safeguarded_method(base):
     assert np.median(np.abs(np.asarray(far.errors) - np.asarray(near.errors))) < 1e-3
 
 
+def naive_sums(surface, u, v, weight, target):
+    """sum_k w_k N_i N_j (e_k, 1), from the surface's basis functions one by one."""
+    nu, nv, _ = surface.shape
+    along_u, along_v = (dense_basis(k, n, x) for k, n, x in zip(surface.knots, (nu, nv), (u, v), strict=True))
+    e = target - np.asarray(surface(u, v))
+    values = weight[:, None] * np.concatenate([e, np.ones((len(u), 1))], axis=1)
+    return np.einsum("ki,kj,kc->ijc", along_u, along_v, values)
+
+
+def dense_basis(knots, count, u):
+    columns = [jf.BSplineCurve(np.eye(count)[:, i : i + 1], knots)(u)[:, 0] for i in range(count)]
+    return np.stack([np.asarray(x) for x in columns], axis=1)
+
+
+SURFACES = {
+    "wavy": wavy_surface(),
+    "random": random_surface(order=(5, 4)),
+    "creased": random_surface(order=(3, 3), repeats=2),
+}
+
+
 @pytest.mark.float32_too
-@pytest.mark.parametrize("surface", [wavy_surface(), random_surface(order=(5, 4))], ids=["wavy", "random"])
+@pytest.mark.parametrize("surface", SURFACES.values(), ids=SURFACES)
 @pytest.mark.parametrize("off", [1e-3, 3e-2])
-def test_what_counts_as_certain_is_a_foot(surface, off):
+def test_feet_are_found_and_summed_over_once(surface, off):
     rng, count = np.random.default_rng(3), 700
     u, v = rng.uniform(0, 1, (2, count))
-    beside = rng.normal(size=(count, 3)) * 0.01
-    target = np.asarray(surface(u, v)) + beside
+    target = np.asarray(surface(u, v)) + rng.normal(size=(count, 3)) * 0.01
     dtype = surface.control_points.dtype
     start = [jnp.asarray(np.clip(x + off * rng.normal(size=count), 0, 1), dtype) for x in (u, v)]
     pieces = make_pieces(*(np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v)))
-    tolerance, one = max(1e-9, 1e3 * eps()), jnp.ones(count, dtype)
+    tolerance, weight = max(1e-9, 1e3 * eps()), rng.uniform(0, 1, count)
+    idle = rng.uniform(size=count) < 0.1
 
     @jax.jit
-    def gather(diagonal, u, v):
-        axes = (pieces.axis_u, pieces.axis_v)
-        problem = Problem(
-            jnp.asarray(target.T, dtype), one, *axes, one, diagonal, jnp.asarray(tolerance, dtype)
-        )
-        return pull(problem, pieces, u, v, 0 * u, u < 0, lambda weight, error: weight, Arrive())
+    def update(u, v, idle):
+        return update_feet(
+            jf.Newton(), pieces, jnp.asarray(target.T, dtype), u, v, jnp.asarray(tolerance, dtype),
+            idle=idle, sums=ControlPointSums(), weight=jnp.asarray(weight, dtype),
+        )  # fmt: skip
 
-    feet, looks, gone, _, active = gather(jnp.asarray(1.0, dtype), *start)
-    certain = np.asarray(looks) > 0
-    assert certain.sum() == active
-    # Who is found in another cell than it started from has left that, and no one found at first sight has.
-    ends = np.asarray(feet[:2])
-    moved = cells_of(pieces, *(np.asarray(x) for x in start)) != cells_of(pieces, *ends)
-    assert np.asarray(gone)[certain & moved & ~on_a_knot(pieces, *ends)].all()
-    assert not np.asarray(gone)[np.asarray(looks) == 1].any()
-    assert certain.mean() > (0.9 if off < 1e-2 else 0.2)
-    u, v = np.asarray(feet[:2])[:, certain]
-    e = target[certain] - np.asarray(surface(u, v))
-    np.testing.assert_allclose(np.linalg.norm(e, axis=1), feet[2][certain], atol=20 * tolerance)
-    for x, du, dv in ((u, 1, 0), (v, 0, 1)):
+    feet, sums = update(*start, jnp.asarray(idle))
+    assert np.asarray(feet.converged).mean() > 0.99
+    u, v = np.asarray(feet.u), np.asarray(feet.v)
+    assert (u[idle] == start[0][idle]).all()
+    e = target - np.asarray(surface(u, v))
+    np.testing.assert_allclose(
+        np.linalg.norm(e, axis=1)[~idle], np.asarray(feet.error)[~idle], atol=20 * tolerance
+    )
+    assert not np.asarray(feet.error)[idle].any()
+    expected = naive_sums(surface, u[~idle], v[~idle], weight[~idle], target[~idle])
+    np.testing.assert_allclose(sums.sums, expected, atol=1e3 * tolerance, rtol=1e-3)
+    certain = np.asarray(feet.converged) & ~idle
+    breaks = [np.unique(k) for k in surface.knots]
+    for x, knots, du, dv in ((u, breaks[0], 1, 0), (v, breaks[1], 0, 1)):
         tangent = np.asarray(surface.derivative(u, v, du, dv))
-        across = np.sum(e * tangent, axis=1) / np.linalg.norm(tangent, axis=1)
-        assert np.abs(across[(x > 0) & (x < 1)]).max() <= 1.01 * tolerance + 50 * eps()
+        across = np.abs(np.sum(e * tangent, axis=1)) / np.linalg.norm(tangent, axis=1)
+        inside = certain & (np.abs(x[:, None] - knots).min(axis=1) > 0)
+        assert across[inside].max() <= 1.01 * tolerance + 50 * eps()
 
 
-def on_a_knot(pieces, u, v):
-    axes = (pieces.axis_u, pieces.axis_v)
-    off = [
-        np.abs(x[:, None] - np.asarray(axis.breaks)).min(axis=1) for axis, x in zip(axes, (u, v), strict=True)
-    ]
-    return np.minimum(*off) < 1e-5
-
-
-def assert_kept(kept, pieces, u, v, left_out):
-    rows, points = kept.rows, len(u)
-    point, filled = np.asarray(rows.point), np.asarray(rows.point) < points
-    np.testing.assert_array_equal(np.sort(point[filled]), np.flatnonzero(~left_out))
-    cell = pieces.axis_u.locate(u) * pieces.axis_v.cells + pieces.axis_v.locate(v)
-    owner = np.broadcast_to(np.asarray(rows.cell)[:, None], point.shape)
-    np.testing.assert_array_equal(owner[filled], cell[point[filled]])
-    assert not filled[int(rows.used) :].any()
-
-
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.2, 1.0])
-def test_kept_rows_hold_every_point_in_a_row_of_its_cell(share):
-    rng, count = np.random.default_rng(5), 2000
-    surface = wavy_surface(9, 8)
-    pieces = make_pieces(*(np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v)))
-    follow = jax.jit(lambda kept, *x: kept.followed(pieces, *x))
+def test_feet_that_are_not_found_are_summed_over_at_their_best():
+    surface, count = wavy_surface(), 300
+    rng = np.random.default_rng(4)
     u, v = rng.uniform(0, 1, (2, count))
-    left_out = rng.uniform(size=count) < 0.1
-    kept, moved = KeptRows.none(count, pieces.cells), np.ones(count, bool)
-    for _ in range(8):
-        kept = follow(kept, u, v, left_out, moved)
-        assert_kept(kept, pieces, u, v, left_out)
-        moved = rng.uniform(size=count) < share
-        u, v = (np.where(moved, rng.uniform(0, 1, count), x) for x in (u, v))
+    target = np.asarray(surface(u, v)) + rng.normal(size=(count, 3)) * 0.05
+    pieces = make_pieces(*(np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v)))
+    start = (jnp.asarray(rng.uniform(0, 1, count)) for _ in range(2))
+    feet, sums = update_feet(
+        jf.Newton(), pieces, jnp.asarray(target.T), *start, jnp.asarray(1e-12),
+        idle=jnp.zeros(count, bool), max_steps=2, sums=ControlPointSums(),
+    )  # fmt: skip
+    assert not np.asarray(feet.converged).all()
+    expected = naive_sums(surface, np.asarray(feet.u), np.asarray(feet.v), np.ones(count), target)
+    np.testing.assert_allclose(sums.sums, expected, atol=1e-9)
 
 
 @pytest.mark.float32_too

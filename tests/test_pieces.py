@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxfit._cells import evaluate_jet, evaluate_values, jet_along_rows, values_along_rows
+from jaxfit._cells import evaluate_jet, evaluate_values
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._pieces import as_surface_arrays, make_axis, make_pieces
 
@@ -26,15 +26,15 @@ def _jet_at(pieces, u, v):
     i, j = (axis.locate(x) for axis, x in zip(axes, (u, v), strict=True))
     s = (u - axes[0].centre[i]) / axes[0].half[i]
     t = (v - axes[1].centre[j]) / axes[1].half[j]
-    cell = jnp.moveaxis(pieces.coefficients[i * axes[1].cells + j], 0, -1)
-    jet = evaluate_jet(cell, s, t)._asdict()
+    cell = jnp.asarray(pieces.coefficients)[i * axes[1].cells + j]
+    jet = {name: x[..., 0] for name, x in evaluate_jet(cell, s[:, None], t[:, None])._asdict().items()}
     scale = {"s": axes[0].half[i], "t": axes[1].half[j]}
     result = {}
     for name, parts in jet.items():
         result[name] = jnp.stack(parts, axis=-1)
         for x in name if name != "value" else ():
             result[name] /= scale[x][:, None]
-    return result, jnp.stack(evaluate_values(cell, s, t), axis=-1)
+    return result, evaluate_values(cell, s[:, None], t[:, None])[..., 0].T
 
 
 @pytest.mark.float32_too
@@ -110,13 +110,11 @@ def test_a_row_of_points_shares_its_polynomial(order):
     rng = np.random.default_rng(8)
     coefficients = jnp.asarray(rng.normal(size=(7, 3, *order)))
     s, t = (jnp.asarray(rng.uniform(-1, 1, (7, 5))) for _ in range(2))
-    several = jnp.moveaxis(coefficients, 0, -1)[..., None]
-    for here, there in zip(jet_along_rows(coefficients, s, t), evaluate_jet(several, s, t), strict=True):
+    jet = evaluate_jet(coefficients, s, t)
+    each = [evaluate_jet(coefficients, s[:, k : k + 1], t[:, k : k + 1]) for k in range(5)]
+    for here, *there in zip(jet, *each, strict=True):
         assert here.shape == (3, 7, 5)
-        np.testing.assert_allclose(here, there, rtol=0, atol=100 * helpers.eps())
+        np.testing.assert_allclose(here, jnp.concatenate(there, axis=2), rtol=0, atol=100 * helpers.eps())
     np.testing.assert_allclose(
-        values_along_rows(coefficients, s, t),
-        evaluate_values(several, s, t),
-        rtol=0,
-        atol=100 * helpers.eps(),
+        evaluate_values(coefficients, s, t), jet.value, rtol=0, atol=100 * helpers.eps()
     )

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import Rows, cells_to_net, row_moments
-from jaxfit._closest import PointSums
+from jaxfit._closest import PointSums, dot
 from jaxfit._splines._pieces import Pieces
 
 
@@ -51,9 +52,13 @@ class ControlPointSums(PointSums):
     ) -> Float[Array, "cells K Lc"]:
         """With the moments of the points in some rows."""
         order_u, columns = total.shape[1:]
-        if self.weigh is not None:
-            weight = self.weigh(weight, jnp.sqrt((e * e).sum(0)))
-        values = jnp.concatenate([weight[None] * e, weight[None]])
+
+        def summands(e: Array, weight: Array) -> Array:
+            if self.weigh is not None:
+                weight = self.weigh(weight, jnp.sqrt(dot(e, e)))
+            return jnp.concatenate([weight[None] * e, weight[None]])
+
+        values = materialise(part.used > 0, summands, e, weight)
         moments = row_moments(s, t, values, order_u, columns // values.shape[0])
         return total.at[part.cell].add(moments, mode="promise_in_bounds", wrap_negative_indices=False)
 

@@ -85,10 +85,17 @@ class GlobalFeet(AbstractErrors):
         if not at_feet:
             known = LocalFeet().feet(surface, points, known, at_feet)
         knots = [np.asarray(x) for x in (surface.knots_u, surface.knots_v)]
-        axes = (make_axis(x, order) for x, order in zip(knots, surface.order, strict=True))
+        axis_u, axis_v = (make_axis(x, order) for x, order in zip(knots, surface.order, strict=True))
         net = np.asarray(surface.control_points)
         tolerance = default_foot_tolerance(net.dtype)
         found = nearest_feet(
-            Newton(), net, *axes, np.asarray(points), known=known, tolerance=tolerance, max_steps=MAX_STEPS
+            Newton(),
+            net,
+            axis_u,
+            axis_v,
+            np.asarray(points),
+            known=known,
+            tolerance=tolerance,
+            max_steps=MAX_STEPS,
         )
         return found["u"], found["v"], np.sqrt(found["f"]), found["converged"]

@@ -7,14 +7,14 @@ import numpy as np
 from jaxfit._base._boundary import Boundary
 
 LARGEST_RATIO = 100.0  # of the diagonals of the two boxes
-LARGEST_GAP = 0.5  # between the boxes, in diagonals of the larger one
+LARGEST_GAP = 2.0  # between the boxes, in diagonals of the larger one
 
 
 def check_same_place(points: Any, boundary: Boundary) -> None:
     """Raise ValueError if concrete points (N, d) and a boundary differ in place or unit.
 
-    Their bounding boxes must be less than half the larger diagonal apart, and neither diagonal more than a
-    hundred times the other. A cloud that bulges far out of its boundary still meets its box.
+    Their boxes may be two diagonals apart, of the larger one, and neither diagonal more than a hundred
+    times the other. A cloud that bulges far out of its boundary still meets its box.
     """
     lines = (boundary.v0, boundary.v1, boundary.u0, boundary.u1)
     cloud, sides = np.asarray(points, float), np.concatenate([np.asarray(x, float) for x in lines])

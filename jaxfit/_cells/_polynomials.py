@@ -37,7 +37,7 @@ def evaluate_values(
 
 
 def _along_rows(coefficients: Array, s: Array, t: Array, partials: Sequence[tuple[int, int]]) -> list[Array]:
-    # Each derivative is a rule of its own, from the coefficients: that takes fewer instructions than
+    # Each derivative is a rule of its own, from the coefficients: that takes less time than
     # rules that share intermediate results, which would have to be stored.
     rows, d, order_u, order_v = coefficients.shape
     flat = coefficients.reshape(rows, d, order_u * order_v).transpose(1, 0, 2)

@@ -17,23 +17,25 @@ class Bounds(NamedTuple):
     `rate` is 1 over half the cell's width: multiplying is cheaper than dividing.
     """
 
-    low: Float[Array, "2 slots"]
-    high: Float[Array, "2 slots"]
-    centre: Float[Array, "2 slots"]
-    half: Float[Array, "2 slots"]
-    rate: Float[Array, "2 slots"]
+    low: Float[Array, "2 1 slots"]
+    high: Float[Array, "2 1 slots"]
+    centre: Float[Array, "2 1 slots"]
+    half: Float[Array, "2 1 slots"]
+    rate: Float[Array, "2 1 slots"]
 
-    def local(self, x: Float[Array, "2 slots"]) -> Float[Array, "2 slots"]:
+    def local(self, x: Float[Array, "2 1 slots"]) -> Float[Array, "2 1 slots"]:
         """Local coordinates of parameters."""
         return (x - self.centre) * self.rate
 
-    def clip_step(self, x: Float[Array, "2 slots"], step: Float[Array, "2 slots"]) -> Float[Array, "2 slots"]:
+    def clip_step(
+        self, x: Float[Array, "2 1 slots"], step: Float[Array, "2 1 slots"]
+    ) -> Float[Array, "2 1 slots"]:
         """A step in local coordinates, cut off at the bounds."""
         return lax.clamp((self.low - x) * self.rate, step, (self.high - x) * self.rate)
 
     def end_of_step(
-        self, x: Float[Array, "2 slots"], step: Float[Array, "2 slots"]
-    ) -> Float[Array, "2 slots"]:
+        self, x: Float[Array, "2 1 slots"], step: Float[Array, "2 1 slots"]
+    ) -> Float[Array, "2 1 slots"]:
         """Where a step ends; one cut off at a bound ends on the bound to the last bit."""
         end = lax.clamp(self.low, x + step * self.half, self.high)
         end = lax.select(step <= (self.low - x) * self.rate, self.low, end)
@@ -53,26 +55,26 @@ def bounds_of_cells(pieces: Pieces, third: Float[Array, " cells"]) -> Float[Arra
 
 def bounds_of_slots(
     cells: Float[Array, "cells 11"], part: Rows, border: Float[Array, "2 2 _"] | None
-) -> tuple[Bounds, Float[Array, "1 slots"]]:
+) -> tuple[Bounds, Float[Array, "1 1 slots"]]:
     """The entries of `bounds_of_cells` for the slots of some rows, in one line.
 
     `border` are narrower bounds (lower and upper, u and v), of all points or of each.
     """
     rows, width = part.point.shape
-    wide = jnp.broadcast_to(take(cells, part.cell, 0).T[..., None], (11, rows, width)).reshape(11, -1)
+    wide = jnp.broadcast_to(take(cells, part.cell, 0).T[..., None], (11, rows, width)).reshape(11, 1, -1)
     *pairs, third = lax.split(wide, (2, 2, 2, 2, 2, 1))
     bounds = Bounds(*pairs)
     if border is not None:
         if border.shape[2] > 1:
             border = part.spread(border.reshape(4, -1)).reshape(2, 2, -1)
-        low, high = jnp.maximum(bounds.low, border[0]), jnp.minimum(bounds.high, border[1])
+        low, high = jnp.maximum(bounds.low, border[0][:, None]), jnp.minimum(bounds.high, border[1][:, None])
         bounds = bounds._replace(low=low, high=high)
     return bounds, third
 
 
 def active_bounds(
-    forms: Forms, x: Float[Array, "2 slots"], bounds: Bounds, tolerance: Float[Array, ""]
-) -> tuple[Bool[Array, "2 slots"], Bool[Array, "1 slots"]]:
+    forms: Forms, x: Float[Array, "2 1 slots"], bounds: Bounds, tolerance: Float[Array, ""]
+) -> tuple[Bool[Array, "2 1 slots"], Bool[Array, "1 1 slots"]]:
     """Which coordinates are held at a bound by the gradient, and whether the free ones are settled.
 
     Settled: the residual's components along the free tangents, lengths, are below the tolerance.

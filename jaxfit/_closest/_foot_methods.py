@@ -21,8 +21,8 @@ LEAST_EIGENVALUE = 1e-3
 # Hu and Wallner's circle is followed up to this share of the way to the centre of curvature.
 TRUSTED_SHARE = 0.5
 
-Step = Float[Array, "2 slots"]
-Pinned = Bool[Array, "2 slots"]
+Step = Float[Array, "2 1 slots"]
+Pinned = Bool[Array, "2 1 slots"]
 
 
 class AbstractFootMethod(eqx.Module):
@@ -32,7 +32,7 @@ class AbstractFootMethod(eqx.Module):
     quadratic: AbstractClassVar[bool]  # whether steps shrink quadratically at a foot
 
     @abstractmethod
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 slots"]) -> Step:
+    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
         """The step in local coordinates; a pinned coordinate does not move.
 
         Where it is `late`, a method that converges linearly takes a Newton step.
@@ -49,7 +49,7 @@ class Newton(AbstractFootMethod):
     drift: ClassVar[bool] = False
     quadratic: ClassVar[bool] = True
 
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 slots"]) -> Step:
+    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
         """Solve the 2x2 system with the Hessian, made positive where it is not."""
         metric, (diagonal, mixed) = forms.metric, forms.hessian
         # Its eigenvalues against the first form are 1 - curvature * distance; lift a negative one.
@@ -77,7 +77,7 @@ class HuWallner(AbstractFootMethod):
     drift: ClassVar[bool] = True
     quadratic: ClassVar[bool] = False
 
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 slots"]) -> Step:
+    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""
         plane = _solve(forms, forms.metric, forms.skew, pinned)
         factor, trusted = self._factor(forms, plane)
@@ -91,7 +91,7 @@ class HuWallner(AbstractFootMethod):
         weight = jnp.concatenate([step * step, 2.0 * product(step)])
         length2 = total(weight * jnp.concatenate([forms.metric, forms.skew]))
         height2 = forms.f - 2.0 * total(step * forms.gradient) + length2
-        along = total(step * (weight[:, None] * forms.drift).sum(0))
+        along = sum(step[k : k + 1] * total(weight * forms.drift[k]) for k in range(2))
         above = total(weight * forms.bend) - along
         bend = _divide(above, length2)  # curvature times height
         # tan(angle on the circle) = curvature * tangential distance / (1 - curvature * height)

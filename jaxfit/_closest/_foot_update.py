@@ -45,9 +45,9 @@ def update_feet(
     r"""Local feet of `target` from the last ones (u, v), and what `sums` makes of the residuals there.
 
     `tolerance` is the largest tangential part of a residual, a length; `idle` points stay where they are and
-    take no part. `within` are bounds (low_u, high_u, low_v, high_v) of every foot's own. `weight` is what a
-    point counts in the sums, 1 without it. Feet that are not found within `max_steps` evaluations count by
-    the best there is.
+    take no part. `within` are bounds (low_u, high_u, low_v, high_v) of every foot's own. `weight` is how much
+    each point counts in the sums, 1 without it. Feet that are not found within `max_steps` evaluations
+    count by the best there is.
 
     Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
     \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.

@@ -1,12 +1,15 @@
 """Inner products of the residual and the derivatives at a foot, which every step is made of.
 
-Vectors are arrays (k, d, slots), what belongs to both parameters arrays (2, slots), numbers (1, slots): so an
-operation serves both parameters, and nothing is broadcast.
+Vectors are arrays (k, d, slots), numbers (k, 1, slots), with k = 2 for what belongs to both parameters: so an
+operation serves both, and nothing is reshaped.
 """
+
+from functools import reduce
+from operator import add
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
@@ -24,15 +27,15 @@ class Expansion(eqx.Module):
 class Forms(eqx.Module):
     """Inner products at the current feet."""
 
-    f: Float[Array, "1 slots"]  # squared distance e . e
-    gradient: Float[Array, "2 slots"]  # e . R_s and e . R_t, half the fall of f
-    metric: Float[Array, "2 slots"]  # E and G of the first fundamental form
-    skew: Float[Array, "1 slots"]  # F of the first fundamental form
-    bend: Float[Array, "3 slots"]  # e . R_ss, e . R_tt, e . R_st
-    drift: Float[Array, "3 2 slots"] | None = None  # second times first derivatives, where a method asks
+    f: Float[Array, "1 1 slots"]  # squared distance e . e
+    gradient: Float[Array, "2 1 slots"]  # e . R_s and e . R_t, half the fall of f
+    metric: Float[Array, "2 1 slots"]  # E and G of the first fundamental form
+    skew: Float[Array, "1 1 slots"]  # F of the first fundamental form
+    bend: Float[Array, "3 1 slots"]  # e . R_ss, e . R_tt, e . R_st
+    drift: Float[Array, "2 3 1 slots"] | None = None  # second times first derivatives, where a method asks
 
     @property
-    def hessian(self) -> tuple[Float[Array, "2 slots"], Float[Array, "1 slots"]]:
+    def hessian(self) -> tuple[Float[Array, "2 1 slots"], Float[Array, "1 1 slots"]]:
         """Diagonal and off-diagonal entry of the Hessian of f / 2."""
         return self.metric - self.bend[:2], self.skew - self.bend[2:]
 
@@ -40,7 +43,7 @@ class Forms(eqx.Module):
 def expand(
     always: Bool[Array, ""],
     coefficients: Float[Array, "rows d K L"],
-    local: Float[Array, "2 slots"],
+    local: Float[Array, "2 1 slots"],
     target: Float[Array, "1 d slots"],
 ) -> Expansion:
     """The surface around every slot's local coordinates; the slots of all rows lie in one line."""
@@ -54,31 +57,36 @@ def inner_products(at: Expansion, drift: bool) -> Forms:
     """All inner products; with `drift` those that Hu and Wallner's step needs besides."""
     e, first, second = at.e, at.first, at.second
     return Forms(
-        f=(e * e).sum(1),
-        gradient=(e * first).sum(1),
-        metric=(first * first).sum(1),
-        skew=(first[:1] * first[1:]).sum(1),
-        bend=(e * second).sum(1),
-        drift=(second[:, None] * first[None]).sum(2) if drift else None,
+        f=inner(e, e),
+        gradient=inner(e, first),
+        metric=inner(first, first),
+        skew=inner(first[:1], first[1:]),
+        bend=inner(e, second),
+        drift=jnp.stack([inner(second, x) for x in (first[:1], first[1:])]) if drift else None,
     )
 
 
-def product(x: Float[Array, "2 slots"]) -> Float[Array, "1 slots"]:
+def product(x: Float[Array, "2 1 slots"]) -> Float[Array, "1 1 slots"]:
     """The product of both entries."""
     return x[:1] * x[1:]
 
 
-def total(x: Float[Array, "k slots"]) -> Float[Array, "1 slots"]:
+def total(x: Float[Array, "k d slots"]) -> Float[Array, "1 d slots"]:
     """The sum of all entries."""
-    return x.sum(0)[None]
+    return reduce(add, lax.split(x, (1,) * x.shape[0]))
 
 
-def either(x: Bool[Array, "2 slots"]) -> Bool[Array, "1 slots"]:
+def inner(x: Float[Array, "j d slots"], y: Float[Array, "k d slots"]) -> Float[Array, "_ 1 slots"]:
+    """Inner products of vectors, written out: a reduction of so few numbers is slower, and not fused."""
+    return reduce(add, lax.split(x * y, (1,) * x.shape[1], 1))
+
+
+def either(x: Bool[Array, "2 1 slots"]) -> Bool[Array, "1 1 slots"]:
     """Whether one of both holds."""
     return x[:1] | x[1:]
 
 
-def both(x: Bool[Array, "2 slots"]) -> Bool[Array, "1 slots"]:
+def both(x: Bool[Array, "2 1 slots"]) -> Bool[Array, "1 1 slots"]:
     """Whether both hold."""
     return x[:1] & x[1:]
 

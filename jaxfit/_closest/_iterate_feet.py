@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
+from jaxfit._barrier import materialise
 from jaxfit._cells import (
     SLOTS_PER_BLOCK,
     Rows,
@@ -25,6 +26,7 @@ from jaxfit._cells import (
 from jaxfit._closest._bounds import Bounds, bounds_of_cells, bounds_of_slots
 from jaxfit._closest._feet import FOUND, GOING, SUMMED_FOUND, SUMMED_GIVEN_UP, Feet, Limits, is_going
 from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._forms import either
 from jaxfit._closest._safeguarded_step import Mode, MovingFeet, advance
 from jaxfit._closest._smooth_regions import SmoothRegion, cells_of_regions, cross_creases, initial_region
 from jaxfit._closest._taylor_projection import third_derivatives
@@ -100,7 +102,8 @@ def iterate_feet(
             last = ~jnp.any(which)
             mode = Mode(last | single_step, last)
             which = (which | last) & waiting(feet)
-            feet = Feet(jnp.where(last, feet.real.at[:2].set(feet.real[2:4]), feet.real), feet.whole)
+            parts = feet.parts
+            feet = Feet(jnp.concatenate([jnp.where(last, parts[2:4], parts[:2]), parts[2:]]))
         u, v = feet.trial
         cell_u, cell_v = pieces.axis_u.locate(u), pieces.axis_v.locate(v)
         if region is not None:
@@ -151,31 +154,29 @@ class _Pass(eqx.Module):
     def _block(self, part: Rows, filled: Array, carry: tuple[Feet, Any]) -> tuple[Feet, Any]:
         feet, total = carry
         bounds, third = bounds_of_slots(self.cells, part, self.border)
-        mine, taking = self._begin(part, filled, feet)
+        mine, taking, before = self._begin(part, filled, feet)
         moved = self._steps(part, mine, bounds, third)
         if self.sums is not None:
-            before = part.spread(feet.whole[1:]).reshape(1, -1)
             moved, total = self._sum(part, taking, before, moved, bounds, total)
-        real = jnp.concatenate([moved.trial, moved.best, moved.f])
-        whole = jnp.concatenate([moved.steps, moved.state])
-        point = jnp.where(taking[0], part.point.reshape(-1), part.points)
-        put = dict(mode="drop", wrap_negative_indices=False)
-        return Feet(feet.real.at[:, point].set(real, **put), feet.whole.at[:, point].set(whole, **put)), total
+        parts = jnp.concatenate([*moved[:5]])[:, 0]
+        point = jnp.where(taking[0, 0], part.point.reshape(-1), part.points)
+        return Feet(feet.parts.at[:, point].set(parts, mode="drop", wrap_negative_indices=False)), total
 
-    def _begin(self, part: Rows, filled: Array, feet: Feet) -> tuple[MovingFeet, Array]:
-        """The feet of a block, of which those that take part in this pass are going."""
+    def _begin(self, part: Rows, filled: Array, feet: Feet) -> tuple[MovingFeet, Array, Array]:
+        """The feet of a block, of which those that take part in this pass are going; and their states."""
         slots = part.point.size
-        trial, best, f = lax.split(part.spread(feet.real).reshape(5, slots), (2, 2, 1))
-        steps, state = lax.split(part.spread(feet.whole).reshape(2, slots), (1, 1))
-        taking = filled.reshape(1, slots)
+        trial, best, f, steps, state = lax.split(
+            part.spread(feet.parts).reshape(7, 1, slots), (2, 2, 1, 1, 1)
+        )
+        taking = filled.reshape(1, 1, slots)
         if self.mode is None:
             taking &= (state == GOING) & (steps < self.limits.steps)
-            state = jnp.where(taking, state, FOUND)
+            going = jnp.where(taking, state, float(FOUND))
         else:
             taking &= state < SUMMED_FOUND
-            state = jnp.where(taking, GOING, FOUND)
+            going = jnp.where(taking, float(GOING), float(FOUND)).astype(f.dtype)
         e = None if self.sums is None else jnp.zeros((1, self.target.shape[0], slots), f.dtype)
-        return MovingFeet(trial, best, f, steps, state, e), taking
+        return MovingFeet(trial, best, f, steps, going, e), taking, state
 
     def _steps(self, part: Rows, feet: MovingFeet, bounds: Bounds, third: Array) -> MovingFeet:
         """The steps of a pass."""
@@ -199,21 +200,28 @@ class _Pass(eqx.Module):
         self, part: Rows, taking: Array, before: Array, feet: MovingFeet, bounds: Bounds, total: Any
     ) -> tuple[MovingFeet, Any]:
         """What those add that are done, and their state with that."""
+        shape, mode = part.point.shape, self.mode
         assert self.sums is not None
-        assert self.mode is not None
-        assert feet.e is not None
-        found, done = feet.state == FOUND, taking & (feet.state == FOUND)
-        if self.creased:  # a foot at a bound may have to go on
-            done &= ~((feet.best <= bounds.low) | (feet.best >= bounds.high)).any(0)[None]
-        done |= taking & self.mode.single
-        found &= ~self.mode.fixed | (before == FOUND)
-        state = jnp.where(done, jnp.where(found, SUMMED_FOUND, SUMMED_GIVEN_UP), feet.state)
-        takes_part = done & jnp.isfinite(feet.f)
-        s, t = jnp.where(takes_part, lax.clamp(-1.0, bounds.local(feet.best), 1.0), 0.0).reshape(
-            2, *part.point.shape
+        assert mode is not None
+        given = None if self.weight is None else part.spread(self.weight[None]).reshape(1, 1, -1)
+
+        def summands(
+            feet: MovingFeet, given: Array | None, before: Array, taking: Array
+        ) -> tuple[Array, ...]:
+            found, done = feet.state == FOUND, taking & (feet.state == FOUND)
+            if self.creased:  # a foot at a bound may have to go on
+                done &= ~either((feet.best <= bounds.low) | (feet.best >= bounds.high))
+            done |= taking & mode.single
+            found &= ~mode.fixed | (before == FOUND)
+            state = jnp.where(done, jnp.where(found, float(SUMMED_FOUND), float(SUMMED_GIVEN_UP)), feet.state)
+            counts = done & jnp.isfinite(feet.f)
+            local = jnp.where(counts, lax.clamp(-1.0, bounds.local(feet.best), 1.0), 0.0)
+            e, weight = jnp.where(counts, feet.e, 0.0), counts.astype(feet.f.dtype)
+            return state, local, e, weight if given is None else weight * given
+
+        always = self.limits.tolerance < jnp.inf
+        state, local, e, weight = materialise(always, summands, feet, given, before, taking)
+        s, t = local.reshape(2, *shape)
+        return feet._replace(state=state), self.sums.add(
+            total, part, s, t, e.reshape(-1, *shape), weight.reshape(shape)
         )
-        e = jnp.where(takes_part, feet.e[0], 0.0).reshape(-1, *part.point.shape)
-        weight = takes_part.reshape(part.point.shape).astype(e.dtype)
-        if self.weight is not None:
-            weight *= part.spread(self.weight[None])[0]
-        return feet._replace(state=state), self.sums.add(total, part, s, t, e, weight)

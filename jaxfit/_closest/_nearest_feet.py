@@ -22,7 +22,7 @@ from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 CHUNK = 1 << 16
 FEW = 1 << 13  # points at a time where most feet are known
 # The reach costs about as much as the search for so many points a cell.
-LEAST_POINTS_PER_CELL = 0.5
+LEAST_POINTS_PER_CELL = 24
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
 
 
@@ -145,8 +145,9 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
             search = Search(sample(net.astype(projector.dtype), *axes))
             take_nearer(best, left, projector(left, *search.nearest(points[left])))
         left = np.arange(len(points))
-    is_surface_in_space = net.shape[2] == 3 and axes[1].polynomials.shape[1] > 1
-    if is_surface_in_space and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
+    # The reach is that of a surface in space whose tangent plane nowhere jumps.
+    smooth = not (axes[0].creased or axes[1].creased) and axes[1].polynomials.shape[1] > 1
+    if smooth and net.shape[2] == 3 and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
         proven = Reach(net, *axes).proves(best["u"], best["v"], np.sqrt(best["f"]))
         left = np.flatnonzero(~(proven & best["converged"]))
     if left.size:

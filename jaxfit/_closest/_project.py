@@ -114,6 +114,6 @@ def _merge(old: Feet, new: Feet, number: Array, limits: Limits) -> Feet:
     nearer = new.best < old.best - limits.slack(old.best)
     nearer = jnp.where(jnp.isinf(old.best), jnp.isfinite(new.best), nearer)
     whole = (number == EVERYWHERE) | (number == AGAIN)
-    state = jnp.where(new.converged & whole, FOUND, GIVEN_UP)
-    spent = Feet(old.real, new.whole).with_state(jnp.full_like(state, GIVEN_UP))
+    state = jnp.where(new.converged & whole, float(FOUND), float(GIVEN_UP)).astype(new.parts.dtype)
+    spent = Feet(jnp.concatenate([old.parts[:5], new.parts[5:]])).with_state(jnp.full_like(state, GIVEN_UP))
     return keep(old.converged, old, keep(nearer | whole, new.with_state(state), spent))

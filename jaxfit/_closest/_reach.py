@@ -96,7 +96,8 @@ class Reach:
         worst = np.clip(np.sqrt(along2), np.maximum(height - turned, 0), height + turned)
         square = np.where(close, away[1:] ** 2, worst**2 + along2)
         height = np.hypot(np.where(close, height, worst), self._outward_part(number, s, t))
-        reach = np.min(square / (2 * np.maximum(height, np.sqrt(ROUNDING) * away[1:])), axis=0)
+        tiny = np.finfo(away.dtype).tiny  # where samples coincide, the reach is zero
+        reach = np.min(square / (2 * np.maximum(height, np.sqrt(ROUNDING) * away[1:]) + tiny), axis=0)
         if count < self.tree.n:
             # Of the samples that are not among these, the nearest are like the last ones that are.
             others = self.diagonal[beside[-OUTERMOST:]].max(axis=0)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
 from jaxfit._closest._bounds import Bounds, active_bounds
@@ -25,11 +25,11 @@ PATIENCE = 30
 class MovingFeet(NamedTuple):
     """`Feet` of the slots of a block, one array for each part, and the residuals at the best ones."""
 
-    trial: Float[Array, "2 slots"]
-    best: Float[Array, "2 slots"]
-    f: Float[Array, "1 slots"]
-    steps: Int[Array, "1 slots"]
-    state: Int[Array, "1 slots"]
+    trial: Float[Array, "2 1 slots"]
+    best: Float[Array, "2 1 slots"]
+    f: Float[Array, "1 1 slots"]
+    steps: Float[Array, "1 1 slots"]
+    state: Float[Array, "1 1 slots"]
     e: Float[Array, "1 d slots"] | None
 
 
@@ -49,7 +49,7 @@ def advance(
     target: Float[Array, "1 d slots"],
     coefficients: Float[Array, "rows d K L"],
     bounds: Bounds,
-    third: Float[Array, "1 slots"],
+    third: Float[Array, "1 1 slots"],
     limits: Limits,
     creased: bool,
     mode: Mode | None,
@@ -60,40 +60,43 @@ def advance(
     every foot can be done after one step.
     """
     always = limits.tolerance < jnp.inf
-    x, best, best_f, steps, state, best_e = feet
-    local = bounds.local(x)
-    at = expand(always, coefficients, local, target)
+    x, late = feet.trial, feet.steps > PATIENCE
+    at = expand(always, coefficients, bounds.local(x), target)
     forms = materialise(always, lambda at: inner_products(at, method.drift), at)
-    late = steps > PATIENCE
 
-    def propose(forms: Forms, x: Array) -> tuple[Array, Array, Array]:
-        pinned, settled = active_bounds(forms, x, bounds, limits.tolerance)
-        step = _downhill(forms, x, method.step(forms, pinned, late), pinned, settled, bounds)
-        return pinned, step, bounds.end_of_step(x, step)
-
-    pinned, step, end = materialise(always, propose, forms, x)
+    # Walls in between, or what follows would compute the same once for each of its results.
+    tolerance = limits.tolerance
+    pinned, settled = materialise(always, lambda *a: active_bounds(*a, bounds, tolerance), forms, x)
+    step = materialise(always, lambda *a: method.step(*a, late), forms, pinned)
+    step = materialise(always, lambda *a: _downhill(*a, bounds), forms, x, step, pinned, settled)
+    end = materialise(always, bounds.end_of_step, x, step)
     ahead = _predict(method, always, at, forms, x, pinned, step, end, bounds, third, limits, mode)
     single = False if mode is None else mode.single
-    # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
-    rounding = 8.0 * float(jnp.finfo(x.dtype).eps)
-    off = jnp.abs(local) - rounding * jnp.abs(x) * bounds.rate
-    judged = (state == GOING) & ((steps < limits.steps) | single) & both(~(off > INSIDE))
-    accepted = forms.f <= best_f + limits.slack(forms.f)
     certain = ahead.certain & ~either(pinned) if creased else ahead.certain
     if creased and mode is not None:  # what is held at a crease may have to go on behind it
         certain |= single
-    found = certain | both(end == x)
-    taken, returns = judged & accepted, judged & ~accepted
-    back = 0.5 * (x + best)
-    spent = both(back == best) | single
-    next_x = _choose(taken, ahead.end, _choose(returns, back, x))
-    leaps = taken & certain
-    here = _choose(leaps, ahead.end, _choose(taken, x, best))
-    here_f = lax.select(leaps, ahead.f, lax.select(taken, forms.f, best_f))
-    state = jnp.where(taken & found, FOUND, jnp.where(returns & spent, GIVEN_UP, state))
-    if best_e is not None:
-        best_e = _choose(leaps[:, None], ahead.e, _choose(taken[:, None], at.e, best_e))
-    return MovingFeet(next_x, here, here_f, steps + judged, state, best_e)
+
+    def judge(feet: MovingFeet, f: Array, e: Array, ahead: Prediction, end: Array) -> MovingFeet:
+        x, best, best_f, steps, state, best_e = feet
+        # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
+        rounding = 8.0 * float(jnp.finfo(x.dtype).eps)
+        off = jnp.abs(bounds.local(x)) - rounding * jnp.abs(x) * bounds.rate
+        judged = (state == GOING) & ((steps < limits.steps) | single) & both(~(off > INSIDE))
+        accepted = f <= best_f + limits.slack(f)
+        taken, returns = judged & accepted, judged & ~accepted
+        leaps = taken & ahead.certain
+        back = 0.5 * (x + best)
+        next_x = _choose(taken, ahead.end, _choose(returns, back, x))
+        here = _choose(leaps, ahead.end, _choose(taken, x, best))
+        here_f = lax.select(leaps, ahead.f, lax.select(taken, f, best_f))
+        gone = returns & (both(back == best) | single)
+        found = leaps | (taken & both(end == x))
+        state = jnp.where(found, float(FOUND), jnp.where(gone, float(GIVEN_UP), state))
+        if best_e is not None:
+            best_e = _choose(leaps, ahead.e, _choose(taken, e, best_e))
+        return MovingFeet(next_x, here, here_f, steps + judged, state, best_e)
+
+    return materialise(always, judge, feet, forms.f, at.e, ahead._replace(certain=certain), end)
 
 
 def _predict(
@@ -132,7 +135,7 @@ def _choose(which: Array, x: Array, y: Array) -> Array:
 
 def _downhill(
     forms: Forms, x: Array, step: Array, pinned: Array, settled: Array, bounds: Bounds
-) -> Float[Array, "2 slots"]:
+) -> Float[Array, "2 1 slots"]:
     """The step, no coordinate longer than LONGEST_STEP, or half the scaled gradient where it leads uphill.
 
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.

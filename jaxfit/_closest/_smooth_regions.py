@@ -37,7 +37,7 @@ def initial_region(pieces: Pieces, feet: Feet) -> SmoothRegion:
     """Every foot in the region it starts from."""
     u, v = feet.trial
     cell = jnp.stack([pieces.axis_u.locate(u), pieces.axis_v.locate(v)])
-    return SmoothRegion(cell, cell, jnp.zeros_like(cell[:1]), jnp.full_like(feet.real[4:], jnp.inf))
+    return SmoothRegion(cell, cell, jnp.zeros_like(cell[:1]), jnp.full_like(feet.parts[4:5], jnp.inf))
 
 
 def cells_of_regions(pieces: Pieces, region: SmoothRegion, cell_u: Array, cell_v: Array) -> list[Array]:
@@ -51,16 +51,16 @@ def cross_creases(
     pieces: Pieces, old: Feet, new: Feet, region: SmoothRegion, limits: Limits
 ) -> tuple[Feet, SmoothRegion]:
     """Send feet that have just been found on a crease to look across it; the rest stay as they are."""
-    found, best = ((new.state == FOUND) & (old.state == GOING))[None], new.real[4:]
+    found, best = ((new.state == FOUND) & (old.state == GOING))[None], new.parts[4:5]
     begins = (region.tries == 0) | (best < region.before - limits.slack(best))
     cell, axes = region.cell, (pieces.axis_u, pieces.axis_v)
-    sides = [_across(a, x, mine) for a, x, mine in zip(axes, new.real[2:4], cell, strict=True)]
+    sides = [_across(a, x, mine) for a, x, mine in zip(axes, new.parts[2:4], cell, strict=True)]
     base, across = jnp.where(begins, cell, region.base), jnp.where(begins, jnp.stack(sides), region.across)
     tries, before = jnp.where(begins, 1, region.tries + 1), jnp.where(begins, best, region.before)
     goes_on = found & (across != base).any(0)[None] & (tries <= LAST_TRY)
     pairs = (base, region.base), (across, region.across), (tries, region.tries), (before, region.before)
     after = SmoothRegion(*(jnp.where(goes_on, after, before) for after, before in pairs))
-    return new.with_state(jnp.where(goes_on[0], GOING, new.state)), after
+    return new.with_state(jnp.where(goes_on[0], float(GOING), new.state)), after
 
 
 def _across(axis: Axis, u: Array, cell: Array) -> Array:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
 from jaxfit._closest._bounds import Bounds
-from jaxfit._closest._forms import Expansion, Forms, both, product, total
+from jaxfit._closest._forms import Expansion, Forms, both, inner, product, total
 from jaxfit._splines._pieces import Pieces
 
 INSIDE = 1.0 + 1e-6  # in units of a cell's half width: where its polynomial is the surface
@@ -29,21 +29,21 @@ ROUNDING = 64.0  # of a squared distance, in units of the last place
 class Prediction(NamedTuple):
     """Where a step ends, the residual predicted there, its square, and whether that is certain."""
 
-    end: Float[Array, "2 slots"]
+    end: Float[Array, "2 1 slots"]
     e: Float[Array, "1 d slots"]
-    f: Float[Array, "1 slots"]
-    certain: Bool[Array, "1 slots"]
+    f: Float[Array, "1 1 slots"]
+    certain: Bool[Array, "1 1 slots"]
 
 
 class _Inverse(NamedTuple):
     """The inverse of the Hessian on the free coordinates; not a number where this is not definite."""
 
-    adjugate: Float[Array, "2 slots"]
-    mixed: Float[Array, "1 slots"]
-    scale: Float[Array, "1 slots"]
-    free: Float[Array, "2 slots"]  # 1, or 0 for coordinates that are held at a bound
+    adjugate: Float[Array, "2 1 slots"]
+    mixed: Float[Array, "1 1 slots"]
+    scale: Float[Array, "1 1 slots"]
+    free: Float[Array, "2 1 slots"]  # 1, or 0 for coordinates that are held at a bound
 
-    def __call__(self, gradient: Float[Array, "2 slots"]) -> Float[Array, "2 slots"]:
+    def __call__(self, gradient: Float[Array, "2 1 slots"]) -> Float[Array, "2 1 slots"]:
         g = gradient * self.free
         return (self.adjugate * g - self.mixed * lax.rev(g, (0,))) * self.scale
 
@@ -67,12 +67,12 @@ def certified_step(
     always: Bool[Array, ""],
     at: Expansion,
     forms: Forms,
-    x: Float[Array, "2 slots"],
-    pinned: Bool[Array, "2 slots"],
+    x: Float[Array, "2 1 slots"],
+    pinned: Bool[Array, "2 1 slots"],
     bounds: Bounds,
-    third: Float[Array, "1 slots"],
+    third: Float[Array, "1 1 slots"],
     tolerance: Float[Array, ""],
-) -> tuple[Prediction, Bool[Array, "1 slots"]]:
+) -> tuple[Prediction, Bool[Array, "1 1 slots"]]:
     """The foot on the Taylor polynomial by two Newton steps, and whether it makes a good next trial.
 
     It is certain if the bound proves the true residual's tangential part to be within the tolerance.
@@ -83,16 +83,16 @@ def certified_step(
         inverse = _inverse(forms, pinned)
         step = inverse(forms.gradient)
         e, tangents = _taylor(at, step)
-        return step + inverse((e * tangents).sum(1)), inverse.free
+        return step + inverse(inner(e, tangents)), inverse.free
 
     step, free = materialise(always, solve, at, forms, pinned)
     e, tangents = materialise(always, _taylor, at, step)
 
     def judge(e: Array, tangents: Array, step: Array, free: Array, forms: Forms, x: Array) -> tuple:
-        f, length = (e * e).sum(1), total(jnp.abs(step))
+        f, length = inner(e, e), total(jnp.abs(step))
         end = x + step * bounds.half
         within = (end >= bounds.low) & (end <= bounds.high) & _in_cell(bounds, x) & _in_cell(bounds, end)
-        slopes, sizes = (e * tangents).sum(1), jnp.sqrt((tangents * tangents).sum(1))
+        slopes, sizes = inner(e, tangents), jnp.sqrt(inner(tangents, tangents))
         turned = 0.5 * third * length * length
         # The product of the true residual with a tangent is at most
         # |e . R^_s| + |e| M L^2 / 2 + (M L^3 / 6) (|R^_s| + M L^2 / 2).
@@ -124,9 +124,8 @@ def _inverse(forms: Forms, pinned: Array) -> _Inverse:
 
 def _taylor(at: Expansion, step: Array) -> tuple[Array, Array]:
     """The residual and the tangents of the polynomial after a step."""
-    d = step[:, None]
-    bend = d * at.second[:2] + lax.rev(d, (0,)) * at.second[2:]
-    e = at.e - (d * (at.first + 0.5 * bend)).sum(0)[None]
+    bend = step * at.second[:2] + lax.rev(step, (0,)) * at.second[2:]
+    e = at.e - total(step * (at.first + 0.5 * bend))
     return e, at.first + bend
 
 
@@ -137,8 +136,8 @@ def _in_cell(bounds: Bounds, x: Array) -> Array:
 def linearised_step(
     at: Expansion,
     forms: Forms,
-    x: Float[Array, "2 slots"],
-    step: Float[Array, "2 slots"],
+    x: Float[Array, "2 1 slots"],
+    step: Float[Array, "2 1 slots"],
     bounds: Bounds,
 ) -> Prediction:
     r"""Where a step ends, and the residual there to first order, $e - R_u \delta u - R_v \delta v$.
@@ -149,6 +148,6 @@ def linearised_step(
     length2 = total(forms.metric * step * step) + 2.0 * forms.skew * product(step)
     shortest = jnp.maximum(along, 0.0) / jnp.where(length2 > 0, length2, 1.0)
     step = jnp.where(2.0 * along >= length2, step, shortest * step)
-    e = at.e - (step[:, None] * at.first).sum(0)[None]
-    f = (e * e).sum(1)
+    e = at.e - total(step * at.first)
+    f = inner(e, e)
     return Prediction(bounds.end_of_step(x, step), e, f, jnp.ones(f.shape, bool))

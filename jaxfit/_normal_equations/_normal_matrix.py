@@ -13,8 +13,8 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells import Rows, row_moments
-from jaxfit._normal_equations._stencil import Stencil, overlap_add, windows
+from jaxfit._cells import Rows, overlap_add, row_moments
+from jaxfit._normal_equations._stencil import Stencil, windows
 from jaxfit._splines._pieces import Axis
 
 # On a CPU, powers and moments of so many points stay in a core's caches. Elsewhere all go at once.

@@ -82,19 +82,6 @@ def shifted_products(
     return lax.scan(add, none, (stored, a, b))[0]
 
 
-def overlap_add(terms: Float[Numbers, "r ..."], axis: int) -> Any:
-    """The sum of `terms[r]`, each moved r places along `axis`, which grows by as many less one."""
-    total: Any = 0.0
-    last, axis = len(terms) - 1, axis % (terms.ndim - 1)
-    for r in range(last + 1):
-        sides = [(r, last - r) if k == axis else (0, 0) for k in range(terms.ndim - 1)]
-        if isinstance(terms, np.ndarray):
-            total = total + np.pad(terms[r], sides)
-        else:
-            total = total + lax.pad(terms[r], jnp.zeros((), terms.dtype), [(*side, 0) for side in sides])
-    return total
-
-
 def windows(x: Any, count: int, size: int, axis: int) -> Any:
     """`size` entries along `axis` from each of the first `count` places, along a new first axis."""
     if isinstance(x, np.ndarray):

@@ -18,8 +18,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxfit._cells import overlap_add
 from jaxfit._checks import is_concrete
-from jaxfit._normal_equations._stencil import Stencil, overlap_add, windows
+from jaxfit._normal_equations._stencil import Stencil, windows
 from jaxfit._splines._pieces import Axis, Numbers
 
 TERMS = np.sqrt([1.0, 2.0, 1.0])  # of R_vv, R_uv and R_uu, by the order of the derivative along u

@@ -1,5 +1,6 @@
 """Knot vectors: uniform, from parameters, their Greville abscissae, and their union."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -92,8 +93,7 @@ def averaging_knots(parameters: ArrayLike, order: int) -> Float[Array, " knots"]
                 f"parameters must not decrease, but parameters[{falls[0] + 1}] is smaller than "
                 "the one before it; sort them."
             )
-    # By NumPy where it can be: every new length would compile anew.
-    return jnp.asarray(knots_by_averaging(np.asarray(values) if is_concrete(values) else values, order))
+    return _on_host(knots_by_averaging, values, order)
 
 
 def knots_by_averaging(parameters: Any, order: int) -> Any:
@@ -135,7 +135,7 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
             f"order must lie between 2 and the number of knots {values.shape[0]} less one, "
             f"but is {order}; pass the order the knots were made for."
         )
-    return jnp.asarray(greville(np.asarray(values) if is_concrete(values) else values, order))
+    return _on_host(greville, values, order)
 
 
 def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) -> Float[Array, " knots"]:
@@ -213,6 +213,13 @@ def _sorted_values(name: str, knots: ArrayLike) -> np.ndarray:
 def greville(knots: Any, order: int) -> Any:
     """`greville_abscissae` of checked knots, NumPy or JAX."""
     return _running_mean(knots, order - 1)[: knots.shape[0] - order]
+
+
+def _on_host(function: Callable[[Any, int], Any], values: Any, order: int) -> Array:
+    """`function(values, order)`, by NumPy unless traced: every new length would compile anew."""
+    if not is_concrete(values):
+        return function(values, order)
+    return jnp.asarray(function(np.asarray(values, np.float64), order).astype(values.dtype))
 
 
 def _running_mean(values: Any, width: int) -> Any:
