@@ -31,6 +31,12 @@ class UnrolledAdjoint(AbstractAdjoint):
     moves_followed : int, optional
         Through how many moves; default as many as move feet, `freeze_after`, or 200 where feet are never
         held. Reverse mode runs each a second time and keeps one net for each.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(adjoint=jf.UnrolledAdjoint()).adjoint
+    UnrolledAdjoint()
     """
 
     moves_followed: int | None = None
@@ -48,6 +54,12 @@ class ImplicitAdjoint(AbstractAdjoint):
     Any parameters at which the surface meets the data solve the interpolation problem, so this is the
     derivative of a solution, though not of the one that the fit returns for other data. It is linear in the
     data and cheaper than `UnrolledAdjoint`.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint()).adjoint
+    ImplicitAdjoint()
     """
 
     def moves(self, freeze_after: int | None) -> None:

@@ -30,7 +30,14 @@ class AbstractAcceleration(eqx.Module):
 
 
 class Richardson(AbstractAcceleration):
-    """The iteration as it is."""
+    """The iteration as it is.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(acceleration=jf.Richardson()).acceleration
+    Richardson()
+    """
 
     needs_spectrum: ClassVar[bool] = False
 
@@ -54,6 +61,12 @@ class Chebyshev(AbstractAcceleration):
     ----------
     margin : float
         By how much the bounds, found at averaged parameters and with weights taken into account, are widened.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(acceleration=jf.Chebyshev()).acceleration
+    Chebyshev()
     """
 
     margin: float = 0.1

@@ -109,6 +109,16 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     0 and 2: fast for low orders, slowly from order 6 on. It may not where rows of the grid differ so much
     that averaged knots suit none of them, or where points repeat; `StandardInterpolation` always has a
     solution.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
+    >>> method = jf.GeometricInterpolation(acceleration=jf.Chebyshev())
+    >>> bool(jf.interpolate(grid, method).converged)
+    True
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

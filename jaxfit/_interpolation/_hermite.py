@@ -63,6 +63,16 @@ class NormalInterpolation(AbstractDirectInterpolation):
 
     The extension announced at the end of Kineri, Wang, Lin and Maekawa (2012); Gofuku, Tamura and Maekawa
     (CAD 41, 2009) meet the normals of curves by iteration.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 5), indexing="ij")
+    >>> sphere = np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=-1)
+    >>> fit = jf.interpolate(sphere, jf.NormalInterpolation(), normals=sphere)
+    >>> bool(fit.converged), fit.surface.shape
+    (True, (12, 10))
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

@@ -77,6 +77,18 @@ def interpolate(
     surface and the feet have derivatives in the data, errors have none. On a closed grid (first row equal to
     the last) the feet stay on their side of the seam. With `symmetry`, fractions are of the diagonal of the
     data as given. A grid in single precision is fitted in double precision if the session has that.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
+    >>> fit = jf.interpolate(grid)
+    >>> bool(fit.converged), fit.surface.shape
+    (True, (6, 5))
+    >>> bool(np.allclose(fit.surface(fit.u, fit.v), grid))
+    True
     """
     check_order(order)
     check_steps("max_steps", max_steps)

@@ -27,7 +27,14 @@ class AbstractRepositioning(eqx.Module):
 
 
 class UnitWeights(AbstractRepositioning):
-    """The plain iteration (14): w = 1."""
+    """The plain iteration (14): w = 1.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(repositioning=jf.UnitWeights()).repositioning
+    UnitWeights()
+    """
 
     needs_spectrum: ClassVar[bool] = False
 
@@ -42,6 +49,12 @@ class OptimalRepositioning(AbstractRepositioning):
     $$w_{ij} = \frac{N_i(\hat u) N_j(\hat v)}{\sum_k N_k^2(\hat u) \sum_l N_l^2(\hat v)}$$
 
     at the closest point of $Q_{ij}$. Where the control point's own basis functions vanish there, w = 1.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(repositioning=jf.OptimalRepositioning()).repositioning
+    OptimalRepositioning()
     """
 
     needs_spectrum: ClassVar[bool] = False
@@ -58,6 +71,12 @@ class ConstantWeight(AbstractRepositioning):
     r"""Lu's constant weight, equation (17): $w = 2 / (1 + \lambda_{\min}(N_1) \lambda_{\min}(N_2))$.
 
     The eigenvalues are those of the collocation matrices of both directions at the averaged parameters.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(repositioning=jf.ConstantWeight()).repositioning
+    ConstantWeight()
     """
 
     needs_spectrum: ClassVar[bool] = True

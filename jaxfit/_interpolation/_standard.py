@@ -71,6 +71,16 @@ class StandardInterpolation(AbstractDirectInterpolation):
 
     Source: section 2.2 of Kineri, Wang, Lin and Maekawa (2012); C. de Boor, A Practical Guide to Splines,
     chapter XIII, for the banded elimination.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
+    >>> fit = jf.interpolate(grid, jf.StandardInterpolation())
+    >>> float(fit.maximum_error) < 1e-5
+    True
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

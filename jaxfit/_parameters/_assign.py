@@ -44,6 +44,13 @@ def curve_parameters(
 
     Raises ValueError for fewer than two points, NaNs, and points that are all equal. Inside
     `jit` values cannot be checked: points that are all equal then give uniform parameters.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0, 0.0], [3.0, 4.0], [3.0, 9.0]])), 8))
+    [0.  0.5 1. ]
     """
     column = jnp.asarray(as_points("points", points, least=2))[:, None]
     steps, length = _rows(column, method.exponent)
@@ -72,6 +79,15 @@ def grid_parameters(grid: ArrayLike, method: AbstractParametrisation = _CHORD_LE
 
     Raises ValueError for a grid with fewer than 2 x 2 points, for NaNs, and where the rows of one
     direction are all degenerate (inside `jit` that gives uniform parameters instead).
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid([0.0, 1.0, 4.0], [0.0, 2.0], indexing="ij")
+    >>> parameters = jf.grid_parameters(np.stack([x, y], axis=-1))
+    >>> print(np.round(parameters.u, 8), np.round(parameters.v, 8))
+    [0.   0.25 1.  ] [0. 1.]
     """
     grid = jnp.asarray(as_floating("grid", grid, 3))
     if grid.shape[0] < 2 or grid.shape[1] < 2 or grid.shape[2] < 1:

@@ -18,6 +18,13 @@ class ChordLength(AbstractParametrisation):
     """Steps proportional to the distance itself: close to arc length on well sampled data.
 
     Source: paper section 2.2; NURBS Book eq. 9.5.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0], [1.0], [5.0]]), jf.ChordLength()), 8))
+    [0.  0.2 1. ]
     """
 
     exponent: ClassVar[float] = 1.0
@@ -27,6 +34,13 @@ class Centripetal(AbstractParametrisation):
     """Steps proportional to the square root of the distance: calmer where spacing jumps.
 
     Source: paper section 2.2; E. T. Y. Lee, CAD 21 (1989); NURBS Book eq. 9.6.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0], [1.0], [5.0]]), jf.Centripetal()), 8))
+    [0.         0.33333333 1.        ]
     """
 
     exponent: ClassVar[float] = 0.5
