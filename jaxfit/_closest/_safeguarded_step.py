@@ -76,16 +76,20 @@ def advance(
     if creased and mode is not None:  # what is held at a crease may have to go on behind it
         certain |= single
 
-    def judge(feet: MovingFeet, f: Array, e: Array, ahead: Prediction, end: Array) -> MovingFeet:
-        x, best, best_f, steps, state, best_e = feet
+    def judge(feet: MovingFeet, f: Array) -> tuple[Array, Array]:
         # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
-        rounding = 8.0 * float(jnp.finfo(x.dtype).eps)
-        off = jnp.abs(bounds.local(x)) - rounding * jnp.abs(x) * bounds.rate
-        judged = (state == GOING) & ((steps < limits.steps) | single) & both(~(off > INSIDE))
-        accepted = f <= best_f + limits.slack(f)
-        taken, returns = judged & accepted, judged & ~accepted
-        leaps = taken & ahead.certain
-        back = 0.5 * (x + best)
+        rounding = 8.0 * float(jnp.finfo(f.dtype).eps)
+        off = jnp.abs(bounds.local(feet.trial)) - rounding * jnp.abs(feet.trial) * bounds.rate
+        judged = (feet.state == GOING) & ((feet.steps < limits.steps) | single) & both(~(off > INSIDE))
+        return judged, judged & (f <= feet.f + limits.slack(f))
+
+    judged, taken = materialise(always, judge, feet, forms.f)
+
+    def choose(
+        feet: MovingFeet, judged: Array, taken: Array, f: Array, e: Array, ahead: Prediction, end: Array
+    ) -> MovingFeet:
+        x, best, best_f, steps, state, best_e = feet
+        returns, leaps, back = judged & ~taken, taken & ahead.certain, 0.5 * (x + best)
         next_x = _choose(taken, ahead.end, _choose(returns, back, x))
         here = _choose(leaps, ahead.end, _choose(taken, x, best))
         here_f = lax.select(leaps, ahead.f, lax.select(taken, f, best_f))
@@ -96,7 +100,8 @@ def advance(
             best_e = _choose(leaps, ahead.e, _choose(taken, e, best_e))
         return MovingFeet(next_x, here, here_f, steps + judged, state, best_e)
 
-    return materialise(always, judge, feet, forms.f, at.e, ahead._replace(certain=certain), end)
+    ahead = ahead._replace(certain=certain)
+    return materialise(always, choose, feet, judged, taken, forms.f, at.e, ahead, end)
 
 
 def _predict(
