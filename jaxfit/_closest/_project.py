@@ -25,13 +25,15 @@ def initial_feet(
 ) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
     """Feet at the places in the domain nearest to (u, v), and their bounds; `idle` ones are `done`."""
     low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
-    u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
+    dtype = pieces.coefficients.dtype
+    u, v = (jnp.clip(*x).astype(dtype) for x in ((u, low_u, high_u), (v, low_v, high_v)))
     feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
-    return feet, None if within is None else _as_bounds(within)
+    return feet, None if within is None else _as_bounds(within).astype(dtype)
 
 
 def _domain(pieces: Pieces) -> Border:
-    along_u, along_v = pieces.axis_u.breaks, pieces.axis_v.breaks
+    dtype = pieces.coefficients.dtype  # knots may be more precise
+    along_u, along_v = (a.breaks.astype(dtype) for a in (pieces.axis_u, pieces.axis_v))
     return along_u[0], along_u[-1], along_v[0], along_v[-1]
 
 
