@@ -15,6 +15,12 @@ EVERYWHERE, AGAIN = 0, 5  # stages; those between are the four borders
 Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v: of all points, or of each
 
 
+def in_precision_of(target: Array, pieces: Pieces) -> Pieces:
+    """The pieces as arrays of the target's floating type; knots may come with another."""
+    arrays = jax.tree.map(jnp.asarray, pieces)
+    return jax.tree.map(lambda x: x.astype(target.dtype) if jnp.issubdtype(x, jnp.floating) else x, arrays)
+
+
 def initial_feet(
     pieces: Pieces,
     u: Float[Array, " points"],
@@ -61,7 +67,7 @@ def project(
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
     """
-    pieces = jax.tree.map(jnp.asarray, pieces)
+    pieces = in_precision_of(target, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     feet, bounds = initial_feet(pieces, u, v, idle, within, FOUND)
     if within is not None or not borders:
