@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit._closest._feet import FOUND, SUMMED_FOUND, Limits
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._iterate_feet import PointSums, iterate_feet
-from jaxfit._closest._project import Border, initial_feet
+from jaxfit._closest._project import Border, in_precision_of, initial_feet
 from jaxfit._splines._pieces import Pieces
 
 MAX_STEPS = 40
@@ -52,7 +51,7 @@ def update_feet(
     Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
     \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.
     """
-    pieces = jax.tree.map(jnp.asarray, pieces)
+    pieces = in_precision_of(target, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     done = FOUND if sums is None else SUMMED_FOUND
     feet, bounds = initial_feet(pieces, u, v, idle, within, done)

@@ -4,6 +4,7 @@ A step that increases the distance (beyond rounding) is halved back towards the 
 accepted distances never increase. A bound is active where the gradient points out of it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -66,10 +67,12 @@ def advance(
 
     # Walls in between, or what follows would compute the same once for each of its results.
     tolerance = limits.tolerance
-    pinned, settled = materialise(always, lambda *a: active_bounds(*a, bounds, tolerance), forms, x)
-    step = materialise(always, lambda *a: method.step(*a, late), forms, pinned)
-    step = materialise(always, lambda *a: _downhill(*a, bounds), forms, x, step, pinned, settled)
-    end = materialise(always, bounds.end_of_step, x, step)
+    pinned, settled = materialise(
+        always, lambda forms, x: active_bounds(forms, x, bounds, tolerance), forms, x
+    )
+    step = materialise(always, lambda forms, p: method.step(forms, p, late), forms, pinned)
+    step = materialise(always, partial(_downhill, bounds), forms, x, step, pinned, settled)
+    end = materialise(always, lambda x, step: bounds.end_of_step(x, step), x, step)
     ahead = _predict(method, always, at, forms, x, pinned, step, end, bounds, third, limits, mode)
     single = False if mode is None else mode.single
     certain = ahead.certain & ~either(pinned) if creased else ahead.certain
@@ -139,7 +142,7 @@ def _choose(which: Array, x: Array, y: Array) -> Array:
 
 
 def _downhill(
-    forms: Forms, x: Array, step: Array, pinned: Array, settled: Array, bounds: Bounds
+    bounds: Bounds, forms: Forms, x: Array, step: Array, pinned: Array, settled: Array
 ) -> Float[Array, "2 1 slots"]:
     """The step, no coordinate longer than LONGEST_STEP, or half the scaled gradient where it leads uphill.
 
