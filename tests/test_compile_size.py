@@ -13,12 +13,11 @@ KNOTS = clamped_uniform(9, 4)
 START = RNG.random(500), RNG.random(500)
 
 
-def base():
-    return jf.BSplineSurface(np.random.default_rng(1).random((9, 9, 3)), KNOTS, KNOTS)
+BASE = jf.BSplineSurface(np.random.default_rng(1).random((9, 9, 3)), KNOTS, KNOTS)
 
 
 def approximated(method):
-    return lambda points: jf.approximate(points, base(), method, start=START).surface.control_points
+    return lambda points: jf.approximate(points, BASE, method, start=START).surface.control_points
 
 
 def interpolated(method):
@@ -31,7 +30,7 @@ ENTRIES = {
     "approximate, paper": (approximated(jf.GeometricApproximation.paper()), POINTS, 2500),
     "approximate, standard": (approximated(jf.StandardApproximation(smoothing=1e-5)), POINTS, 2500),
     "approximate, orthogonal": (approximated(jf.OrthogonalDistance()), POINTS, 4200),
-    "closest_point": (lambda points: jf.closest_point(base(), points).u, POINTS, 2000),
+    "closest_point": (lambda points: jf.closest_point(BASE, points).u, POINTS, 2000),
     "interpolate, geometric": (GEOMETRIC, GRID, 2500),
     "interpolate, geometric, gradient": (jax.grad(lambda grid: GEOMETRIC(grid).sum()), GRID, 5000),
     "interpolate, standard": (interpolated(jf.StandardInterpolation()), GRID, 1000),

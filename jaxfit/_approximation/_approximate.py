@@ -130,6 +130,8 @@ def approximate(
         feet = nearest.u, nearest.v
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet)
     order = _order_by_cell(begun, u, v, cloud.shape[0])
+    if not is_concrete(order):
+        u, v = jnp.asarray(u), jnp.asarray(v)
     loop = begin(method, problem.ordered(order), begun, u[order], v[order], max_steps)
     loop, stats = run(method, problem.ordered(order), loop, progress if concrete else None)
     surface = _fitted(loop, base, begun, unit)

@@ -32,6 +32,18 @@ class ControlPointSums(PointSums):
 
     `weigh(weight, error)` gives the weights that count, from those of the points and the lengths of their
     residuals; without it the weights of the points count.
+
+    Notes
+    -----
+    The numerators and denominators of Algorithm 1, section 4.1 of Kineri, Wang, Lin and Maekawa (2012). Pass
+    it to `update_feet` as `sums`.
+
+    Examples
+    --------
+    >>> jf.ControlPointSums().weigh is None
+    True
+    >>> jf.ControlPointSums(lambda weight, error: weight / (1 + error)).weigh(1.0, 3.0)
+    0.25
     """
 
     weigh: Callable[[Array, Array], Array] | None = None

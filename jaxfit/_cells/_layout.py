@@ -33,7 +33,7 @@ def row_coefficients(pieces: Pieces, rows: Rows) -> Float[Array, "rows d K L"]:
     return take(pieces.coefficients, rows.cell, 0)
 
 
-def take(x: Shaped[Array, "..."], index: Int[Array, "..."], axis: int) -> Shaped[Array, "..."]:
+def take(x: Any, index: Int[Array, "..."], axis: int) -> Shaped[Array, "..."]:
     """Entries along an axis, given by numbers that are known to be within bounds."""
     at = (slice(None),) * axis + (index,)
     return jnp.asarray(x).at[at].get(mode="promise_in_bounds", wrap_negative_indices=False)

@@ -50,7 +50,7 @@ def bounds_of_cells(pieces: Pieces, third: Float[Array, " cells"]) -> Float[Arra
     pairs = jnp.stack(
         [jnp.broadcast_to(along_u[:, None], cells), jnp.broadcast_to(along_v[None], cells)], axis=3
     )
-    return jnp.concatenate([pairs.reshape(-1, 10), third[:, None]], axis=1)
+    return jnp.concatenate([pairs.reshape(-1, 10).astype(third.dtype), third[:, None]], axis=1)
 
 
 def bounds_of_slots(

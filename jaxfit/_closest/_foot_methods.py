@@ -101,7 +101,7 @@ class HuWallner(AbstractFootMethod):
         weight = jnp.concatenate([step * step, 2.0 * product(step)])
         length2 = total(weight * jnp.concatenate([forms.metric, forms.skew]))
         height2 = forms.f - 2.0 * total(step * forms.gradient) + length2
-        along = sum(step[k : k + 1] * total(weight * forms.drift[k]) for k in range(2))
+        along = step[:1] * total(weight * forms.drift[0]) + step[1:] * total(weight * forms.drift[1])
         above = total(weight * forms.bend) - along
         bend = _divide(above, length2)  # curvature times height
         # tan(angle on the circle) = curvature * tangential distance / (1 - curvature * height)

@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit._closest._feet import FOUND, SUMMED_FOUND, Limits
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._iterate_feet import PointSums, iterate_feet
-from jaxfit._closest._project import Border, initial_feet
+from jaxfit._closest._project import Border, in_precision_of, initial_feet
 from jaxfit._splines._pieces import Pieces
 
 MAX_STEPS = 40
@@ -51,8 +50,19 @@ def update_feet(
 
     Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
     \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.WorkingSurface.of(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> target, start = jnp.array([[0.25, 3.0], [0.5, 0.5], [2.0, 0.0]]), jnp.array([0.5, 0.5])
+    >>> idle, tolerance = jnp.array([False, False]), jnp.asarray(1e-5)
+    >>> feet, _ = jf.update_feet(jf.Newton(), square.pieces, target, start, start, tolerance, idle=idle)
+    >>> np.round(feet.u, 3).tolist(), np.round(feet.v, 3).tolist(), np.round(feet.error, 3).tolist()
+    ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
-    pieces = jax.tree.map(jnp.asarray, pieces)
+    pieces = in_precision_of(target, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     done = FOUND if sums is None else SUMMED_FOUND
     feet, bounds = initial_feet(pieces, u, v, idle, within, done)

@@ -32,7 +32,7 @@ from jaxfit._closest._smooth_regions import SmoothRegion, cells_of_regions, cros
 from jaxfit._closest._taylor_projection import third_derivatives
 from jaxfit._splines._pieces import Pieces
 
-# So many steps in a row where rows hold several points, as long as one of so many feet of a block is going.
+# So many steps in a row where rows hold several points, as long as one of so many feet is still going.
 STEPS_PER_PASS = 3
 ONE_OF = 3
 # A block on a CPU is too little to be shared among cores, which costs more than it gains; whole clouds are
@@ -190,9 +190,11 @@ class _Pass(eqx.Module):
         if part.point.shape[1] == 1:  # laying feet out anew costs less than moving some that are done
             return step((jnp.zeros((), jnp.int32), feet))[1]
 
+        begun = jnp.sum(feet.state == GOING, dtype=jnp.int32)
+
         def goes_on(carry: tuple[Array, MovingFeet]) -> Array:
             going = jnp.sum(carry[1].state == GOING, dtype=jnp.int32)
-            return (carry[0] < STEPS_PER_PASS) & ((ONE_OF * going > part.point.size) | (carry[0] == 0))
+            return (carry[0] < STEPS_PER_PASS) & (ONE_OF * going > begun)
 
         return lax.while_loop(goes_on, step, (jnp.zeros((), jnp.int32), feet))[1]
 
@@ -216,6 +218,7 @@ class _Pass(eqx.Module):
             state = jnp.where(done, jnp.where(found, float(SUMMED_FOUND), float(SUMMED_GIVEN_UP)), feet.state)
             counts = done & jnp.isfinite(feet.f)
             local = jnp.where(counts, lax.clamp(-1.0, bounds.local(feet.best), 1.0), 0.0)
+            assert feet.e is not None
             e, weight = jnp.where(counts, feet.e, 0.0), counts.astype(feet.f.dtype)
             return state, local, e, weight if given is None else weight * given
 

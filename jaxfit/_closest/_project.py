@@ -15,6 +15,14 @@ EVERYWHERE, AGAIN = 0, 5  # stages; those between are the four borders
 Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v: of all points, or of each
 
 
+def in_precision_of(target: Array, pieces: Pieces) -> Pieces:
+    """The pieces as arrays of the target's floating type; knots may come with another."""
+    arrays = jax.tree.map(jnp.asarray, pieces)
+    return jax.tree.map(
+        lambda x: x.astype(target.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, arrays
+    )
+
+
 def initial_feet(
     pieces: Pieces,
     u: Float[Array, " points"],
@@ -25,13 +33,15 @@ def initial_feet(
 ) -> tuple[Feet, Float[Array, "2 2 _"] | None]:
     """Feet at the nearest places to (u, v) in the domain, and their bounds; `idle` ones are `done`."""
     low_u, high_u, low_v, high_v = _domain(pieces) if within is None else within
-    u, v = jnp.clip(u, low_u, high_u), jnp.clip(v, low_v, high_v)
+    dtype = pieces.coefficients.dtype
+    u, v = (jnp.clip(*x).astype(dtype) for x in ((u, low_u, high_u), (v, low_v, high_v)))
     feet = Feet.begin(u, v, state=GOING if idle is None else jnp.where(idle, done, GOING))
-    return feet, None if within is None else _as_bounds(within)
+    return feet, None if within is None else _as_bounds(within).astype(dtype)
 
 
 def _domain(pieces: Pieces) -> Border:
-    along_u, along_v = pieces.axis_u.breaks, pieces.axis_v.breaks
+    dtype = pieces.coefficients.dtype  # knots may be more precise
+    along_u, along_v = (a.breaks.astype(dtype) for a in (pieces.axis_u, pieces.axis_v))
     return along_u[0], along_u[-1], along_v[0], along_v[-1]
 
 
@@ -60,7 +70,7 @@ def project(
     The coordinates must be small against nothing but their own extent (centre them first): rounding is
     judged by their largest magnitude.
     """
-    pieces = jax.tree.map(jnp.asarray, pieces)
+    pieces = in_precision_of(target, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     feet, bounds = initial_feet(pieces, u, v, idle, within, FOUND)
     if within is not None or borders is False:

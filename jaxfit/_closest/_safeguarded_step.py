@@ -4,6 +4,7 @@ A step that increases the distance (beyond rounding) is halved back towards the 
 accepted distances never increase. A bound is active where the gradient points out of it.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -66,26 +67,32 @@ def advance(
 
     # Walls in between, or what follows would compute the same once for each of its results.
     tolerance = limits.tolerance
-    pinned, settled = materialise(always, lambda *a: active_bounds(*a, bounds, tolerance), forms, x)
-    step = materialise(always, lambda *a: method.step(*a, late), forms, pinned)
-    step = materialise(always, lambda *a: _downhill(*a, bounds), forms, x, step, pinned, settled)
-    end = materialise(always, bounds.end_of_step, x, step)
+    pinned, settled = materialise(
+        always, lambda forms, x: active_bounds(forms, x, bounds, tolerance), forms, x
+    )
+    step = materialise(always, lambda forms, p: method.step(forms, p, late), forms, pinned)
+    step = materialise(always, partial(_downhill, bounds), forms, x, step, pinned, settled)
+    end = materialise(always, lambda x, step: bounds.end_of_step(x, step), x, step)
     ahead = _predict(method, always, at, forms, x, pinned, step, end, bounds, third, limits, mode)
     single = False if mode is None else mode.single
     certain = ahead.certain & ~either(pinned) if creased else ahead.certain
     if creased and mode is not None:  # what is held at a crease may have to go on behind it
         certain |= single
 
-    def judge(feet: MovingFeet, f: Array, e: Array, ahead: Prediction, end: Array) -> MovingFeet:
-        x, best, best_f, steps, state, best_e = feet
+    def judge(feet: MovingFeet, f: Array) -> tuple[Array, Array]:
         # Not a number counts as inside, and so does what only rounding puts outside: nothing waits for ever.
-        rounding = 8.0 * float(jnp.finfo(x.dtype).eps)
-        off = jnp.abs(bounds.local(x)) - rounding * jnp.abs(x) * bounds.rate
-        judged = (state == GOING) & ((steps < limits.steps) | single) & both(~(off > INSIDE))
-        accepted = f <= best_f + limits.slack(f)
-        taken, returns = judged & accepted, judged & ~accepted
-        leaps = taken & ahead.certain
-        back = 0.5 * (x + best)
+        rounding = 8.0 * float(jnp.finfo(f.dtype).eps)
+        off = jnp.abs(bounds.local(feet.trial)) - rounding * jnp.abs(feet.trial) * bounds.rate
+        judged = (feet.state == GOING) & ((feet.steps < limits.steps) | single) & both(~(off > INSIDE))
+        return judged, judged & (f <= feet.f + limits.slack(f))
+
+    judged, taken = materialise(always, judge, feet, forms.f)
+
+    def choose(
+        feet: MovingFeet, judged: Array, taken: Array, f: Array, e: Array, ahead: Prediction, end: Array
+    ) -> MovingFeet:
+        x, best, best_f, steps, state, best_e = feet
+        returns, leaps, back = judged & ~taken, taken & ahead.certain, 0.5 * (x + best)
         next_x = _choose(taken, ahead.end, _choose(returns, back, x))
         here = _choose(leaps, ahead.end, _choose(taken, x, best))
         here_f = lax.select(leaps, ahead.f, lax.select(taken, f, best_f))
@@ -96,7 +103,8 @@ def advance(
             best_e = _choose(leaps, ahead.e, _choose(taken, e, best_e))
         return MovingFeet(next_x, here, here_f, steps + judged, state, best_e)
 
-    return materialise(always, judge, feet, forms.f, at.e, ahead._replace(certain=certain), end)
+    ahead = ahead._replace(certain=certain)
+    return materialise(always, choose, feet, judged, taken, forms.f, at.e, ahead, end)
 
 
 def _predict(
@@ -134,7 +142,7 @@ def _choose(which: Array, x: Array, y: Array) -> Array:
 
 
 def _downhill(
-    forms: Forms, x: Array, step: Array, pinned: Array, settled: Array, bounds: Bounds
+    bounds: Bounds, forms: Forms, x: Array, step: Array, pinned: Array, settled: Array
 ) -> Float[Array, "2 1 slots"]:
     """The step, no coordinate longer than LONGEST_STEP, or half the scaled gradient where it leads uphill.
 

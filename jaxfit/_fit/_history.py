@@ -22,6 +22,13 @@ class ErrorHistory(eqx.Module):
     Rows of `errors`: average and maximum error as fractions of the diagonal, evaluations of the surface for a
     foot, and change of its parameters since the iteration before, both on average. Rows of `counts`: points
     that took part, and control points along u and v.
+
+    Examples
+    --------
+    >>> history = jax.tree.map(jnp.asarray, jf.ErrorHistory.empty(max_steps=10, dtype=np.float32))
+    >>> history = history.append(jnp.asarray(0), (0.5, 1.0, 3.0, 0.0), jnp.array([60, 6, 5], jnp.int32))
+    >>> history.at(jnp.asarray(0)).tolist()
+    [0.5, 1.0, 3.0, 0.0]
     """
 
     errors: Float[Any, "4 steps"]

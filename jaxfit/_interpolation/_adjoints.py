@@ -34,8 +34,9 @@ class UnrolledAdjoint(AbstractAdjoint):
 
     Examples
     --------
-    >>> jf.UnrolledAdjoint().moves(freeze_after=2), jf.UnrolledAdjoint(moves_followed=5).moves(freeze_after=2)
-    (2, 5)
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(adjoint=jf.UnrolledAdjoint()).adjoint
+    UnrolledAdjoint()
     """
 
     moves_followed: int | None = None
@@ -56,6 +57,7 @@ class ImplicitAdjoint(AbstractAdjoint):
 
     Examples
     --------
+    >>> import jaxfit as jf
     >>> jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint()).adjoint
     ImplicitAdjoint()
     """

@@ -34,7 +34,8 @@ class Richardson(AbstractAcceleration):
 
     Examples
     --------
-    >>> jf.GeometricInterpolation().acceleration
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(acceleration=jf.Richardson()).acceleration
     Richardson()
     """
 
@@ -63,6 +64,7 @@ class Chebyshev(AbstractAcceleration):
 
     Examples
     --------
+    >>> import jaxfit as jf
     >>> jf.GeometricInterpolation(acceleration=jf.Chebyshev()).acceleration
     Chebyshev()
     """

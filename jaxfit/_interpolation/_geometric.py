@@ -103,17 +103,8 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         `stall_window` iterations, as it does at rounding level. It then returns the best surface whose
         closest points it has computed.
 
-    Raises
-    ------
-    ValueError
-        If a number is out of range.
-    TypeError
-        If a field is of the wrong kind.
-
     Notes
     -----
-    Section 3 of Kineri, Wang, Lin and Maekawa (2012).
-
     It converges where the eigenvalues of the collocation matrix at the feet, times the weights, lie between
     0 and 2: fast for low orders, slowly from order 6 on. It may not where rows of the grid differ so much
     that averaged knots suit none of them, or where points repeat; `StandardInterpolation` always has a
@@ -121,9 +112,13 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
 
     Examples
     --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
     >>> method = jf.GeometricInterpolation(acceleration=jf.Chebyshev())
-    >>> method.repositioning, method.freeze_after, method.parametrisation
-    (OptimalRepositioning(), 2, ChordLength())
+    >>> bool(jf.interpolate(grid, method).converged)
+    True
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

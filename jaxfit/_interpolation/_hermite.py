@@ -66,8 +66,13 @@ class NormalInterpolation(AbstractDirectInterpolation):
 
     Examples
     --------
-    >>> jf.NormalInterpolation(normal_tolerance=1e-3).parametrisation
-    ChordLength()
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 5), indexing="ij")
+    >>> sphere = np.stack([x, y, np.sqrt(1 - x**2 - y**2)], axis=-1)
+    >>> fit = jf.interpolate(sphere, jf.NormalInterpolation(), normals=sphere)
+    >>> bool(fit.converged), fit.surface.shape
+    (True, (12, 10))
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

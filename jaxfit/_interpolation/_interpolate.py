@@ -80,11 +80,15 @@ def interpolate(
 
     Examples
     --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
     >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
-    >>> grid = np.stack([x, y, x * y], axis=2)
-    >>> fit = jf.interpolate(grid, jf.StandardInterpolation())
-    >>> fit.surface.shape, bool(fit.converged), fit.message
-    ((6, 5), True, 'all tolerances are met.')
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
+    >>> fit = jf.interpolate(grid)
+    >>> bool(fit.converged), fit.surface.shape
+    (True, (6, 5))
+    >>> bool(np.allclose(fit.surface(fit.u, fit.v), grid))
+    True
     """
     check_order(order)
     check_steps("max_steps", max_steps)

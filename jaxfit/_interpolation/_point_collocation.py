@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._splines._pieces import Axis
 
+UNROLL = 16  # terms of a sum in one turn of a loop
+
 
 class PointCollocation(eqx.Module):
     """The rows of N: the number of the first basis function along u and along v, and the values of all."""
@@ -107,10 +109,20 @@ def control_point_windows(
 
 
 def _window_sum(net: Array, first_u: Array, first_v: Array, basis_u: Array, basis_v: Array) -> Array:
-    """R at the points whose control points begin at (first_u, first_v)."""
-    windows = control_point_windows(net, first_u, first_v, len(basis_u), len(basis_v))
-    weights = basis_u[:, None] * basis_v[None]
-    return jnp.sum(weights[None] * windows, axis=(1, 2))
+    """R at the points whose control points begin at (first_u, first_v), one term of all points after the
+    other: in loops a gather of whole windows takes twenty times as long.
+    """
+    d, nu, nv = net.shape
+    (order_u, *points), order_v = basis_u.shape, len(basis_v)
+    flat, first = net.reshape(d, nu * nv), first_u * nv + first_v
+    weights = (basis_u[:, None] * basis_v[None]).reshape(order_u * order_v, 1, *points)
+    shifts = (nv * np.arange(order_u)[:, None] + np.arange(order_v)[None, :]).reshape(-1).astype(np.int32)
+
+    def add(total: Any, term: Any) -> tuple[Any, None]:
+        shift, weight = term
+        return total + weight * flat.at[:, first + shift].get(mode="promise_in_bounds"), None
+
+    return lax.scan(add, jnp.zeros((d, *points), net.dtype), (shifts, weights), unroll=UNROLL)[0]
 
 
 def _skipped(order: int) -> int:

@@ -31,6 +31,7 @@ class UnitWeights(AbstractRepositioning):
 
     Examples
     --------
+    >>> import jaxfit as jf
     >>> jf.GeometricInterpolation(repositioning=jf.UnitWeights()).repositioning
     UnitWeights()
     """
@@ -51,7 +52,8 @@ class OptimalRepositioning(AbstractRepositioning):
 
     Examples
     --------
-    >>> jf.GeometricInterpolation().repositioning
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(repositioning=jf.OptimalRepositioning()).repositioning
     OptimalRepositioning()
     """
 
@@ -72,6 +74,7 @@ class ConstantWeight(AbstractRepositioning):
 
     Examples
     --------
+    >>> import jaxfit as jf
     >>> jf.GeometricInterpolation(repositioning=jf.ConstantWeight()).repositioning
     ConstantWeight()
     """

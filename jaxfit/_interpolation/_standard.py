@@ -74,8 +74,13 @@ class StandardInterpolation(AbstractDirectInterpolation):
 
     Examples
     --------
-    >>> jf.StandardInterpolation().iterative, jf.StandardInterpolation(per_point=True).iterative
-    (False, True)
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
+    >>> fit = jf.interpolate(grid, jf.StandardInterpolation())
+    >>> float(fit.maximum_error) < 1e-5
+    True
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

@@ -47,8 +47,10 @@ def curve_parameters(
 
     Examples
     --------
-    >>> print(np.round(jf.curve_parameters(np.array([[0.0], [1.0], [3.0], [4.0]])), 3))
-    [0.   0.25 0.75 1.  ]
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0, 0.0], [3.0, 4.0], [3.0, 9.0]])), 8))
+    [0.  0.5 1. ]
     """
     column = jnp.asarray(as_points("points", points, least=2))[:, None]
     steps, length = _rows(column, method.exponent)
@@ -80,10 +82,12 @@ def grid_parameters(grid: ArrayLike, method: AbstractParametrisation = _CHORD_LE
 
     Examples
     --------
+    >>> import jaxfit as jf
+    >>> import numpy as np
     >>> x, y = np.meshgrid([0.0, 1.0, 4.0], [0.0, 2.0], indexing="ij")
-    >>> parameters = jf.grid_parameters(np.stack([x, y], axis=2))
-    >>> np.round(parameters.u, 3).tolist(), parameters.v.tolist(), parameters.rows_u.shape
-    ([0.0, 0.25, 1.0], [0.0, 1.0], (3, 2))
+    >>> parameters = jf.grid_parameters(np.stack([x, y], axis=-1))
+    >>> print(np.round(parameters.u, 8), np.round(parameters.v, 8))
+    [0.   0.25 1.  ] [0. 1.]
     """
     grid = jnp.asarray(as_floating("grid", grid, 3))
     if grid.shape[0] < 2 or grid.shape[1] < 2 or grid.shape[2] < 1:

@@ -21,8 +21,10 @@ class ChordLength(AbstractParametrisation):
 
     Examples
     --------
-    >>> print(np.round(jf.curve_parameters(np.array([[0.0], [1.0], [5.0], [6.0]]), jf.ChordLength()), 3))
-    [0.    0.167 0.833 1.   ]
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0], [1.0], [5.0]]), jf.ChordLength()), 8))
+    [0.  0.2 1. ]
     """
 
     exponent: ClassVar[float] = 1.0
@@ -35,8 +37,10 @@ class Centripetal(AbstractParametrisation):
 
     Examples
     --------
-    >>> print(np.round(jf.curve_parameters(np.array([[0.0], [1.0], [5.0], [6.0]]), jf.Centripetal()), 3))
-    [0.   0.25 0.75 1.  ]
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> print(np.round(jf.curve_parameters(np.asarray([[0.0], [1.0], [5.0]]), jf.Centripetal()), 8))
+    [0.         0.33333333 1.        ]
     """
 
     exponent: ClassVar[float] = 0.5

@@ -60,9 +60,15 @@ class Reflection(eqx.Module):
 
     Examples
     --------
-    >>> mirror = jf.Reflection(point=[1.0, 0.0, 0.0], normal=[1.0, 0.0, 0.0])
-    >>> mirror.mirror(np.array([[3.0, 4.0, 5.0]])).tolist()
-    [[-1.0, 4.0, 5.0]]
+    >>> import jaxfit as jf
+    >>> import numpy as np
+    >>> x, y = np.meshgrid([-1.0, 0.0, 1.5], [0.0, 1.0], indexing="ij")
+    >>> grid = np.stack([x, y, x**2], axis=-1)
+    >>> reflection = jf.Reflection(axis=0, point=(0, 0, 0), normal=(1, 0, 0))
+    >>> print(np.round(reflection.symmetrise_points(grid)[:, 0, 0], 8))
+    [-1.25  0.    1.25]
+    >>> print(round(float(reflection.asymmetry(grid)), 4))
+    1.3463
     """
 
     axis: int = eqx.field(static=True)
