@@ -47,7 +47,7 @@ def ours(work, name, steps):
     points, start = np.load(work / f"{name}_pts.npy"), np.load(work / f"{name}_uv0.npy")
     base = jf.BSplineSurface(net, u, v)
     begun = time.perf_counter()
-    plain = jf.GeometricApproximation(relaxation=1.0, acceleration=None, foresee=False)
+    plain = jf.GeometricApproximation(relaxation=1.0, acceleration=None, single_step=False)
     options = dict(tol_average=1e-12, max_steps=steps, start=(start[:, 0], start[:, 1]))
     fit = jf.approximate(points, base, plain, **options)
     return fit, time.perf_counter() - begun, np.linalg.norm(np.ptp(points, axis=0))

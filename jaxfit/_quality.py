@@ -74,6 +74,14 @@ def zebra(
     The picture of Figs. 1 and 10 of Kineri, Wang, Lin and Maekawa (2012). On a symmetric surface the
     stripes are symmetric if `view` lies in its plane, and `direction` in it or across it. Works under `jit`
     and `vmap`; the derivative is zero where the ray meets the axis.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.BSplineSurface(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> round(float(jf.zebra(square, 0.5, 0.5)), 3)
+    1.0
     """
     axis, eye = _checked(direction, stripes, view)
     return _wave(surface.normal(u, v), axis, eye, int(stripes))

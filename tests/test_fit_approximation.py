@@ -18,7 +18,7 @@ BOUNDARY = jf.Boundary(**EDGES)
 
 def plain(**options):
     """Algorithm 1 as it stands, without what the default adds."""
-    fields = dict(relaxation=1.0, acceleration=None, foresee=False)
+    fields = dict(relaxation=1.0, acceleration=None, single_step=False)
     return jf.GeometricApproximation(**(fields | options))
 
 
@@ -190,7 +190,7 @@ def test_parts_of_methods_that_are_no_objects_get_a_sentence():
         for part in ("insertion=True", "insertion=jf.KnotInsertion", "foot_method='newton'")
     ]
     wrong += [
-        ("GeometricApproximation", f"{x}='yes'") for x in ("fairing", "acceleration", "local", "foresee")
+        ("GeometricApproximation", f"{x}='yes'") for x in ("fairing", "acceleration", "local", "single_step")
     ]
     lines = ["import jaxfit as jf"]
     for kind, part in wrong:

@@ -86,8 +86,8 @@ def test_batches_grow_each_their_own_way(base):
 
 def test_one_step_feet_come_as_close_as_converged_ones(base):
     ends = []
-    for foresee in (False, True):
-        method = jf.GeometricApproximation(relaxation=1.0, acceleration=None, foresee=foresee)
+    for single_step in (False, True):
+        method = jf.GeometricApproximation(relaxation=1.0, acceleration=None, single_step=single_step)
         fit = jf.approximate(POINTS, base, method, tol_average=1e-3)
         assert bool(fit.converged), fit.message
         feet = jf.closest_point(fit.surface, POINTS)
@@ -99,7 +99,7 @@ def test_one_step_feet_come_as_close_as_converged_ones(base):
 
 def test_the_papers_setting_is_at_hand():
     method = jf.GeometricApproximation.paper(fairing=None)
-    assert (method.relaxation, method.acceleration, method.foresee) == (1.0, None, False)
+    assert (method.relaxation, method.acceleration, method.single_step) == (1.0, None, False)
     assert method.fairing is None
     assert method.insertion == jf.KnotInsertion(every=40)
     with pytest.raises(ValueError, match="every must be"):

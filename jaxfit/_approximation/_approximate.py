@@ -87,6 +87,18 @@ def approximate(
     Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
     differentiate through a fit raises a TypeError. Outside transformations clouds are padded to one of four
     sizes per octave, so that a second cloud of similar size compiles nothing.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
+    >>> grid = np.stack([x, y, x * y], axis=2)
+    >>> base = jf.base_surface(jf.Boundary.from_grid(grid), net=(6, 5))
+    >>> points = grid.reshape(-1, 3) + 0.2 * np.sin(3 * x * y).reshape(-1, 1)
+    >>> fit = jf.approximate(points, base, max_steps=3)
+    >>> fit.surface.shape, fit.errors.shape, bool(fit.history.average[-1] < fit.history.average[0])
+    ((6, 5), (60,), True)
+    >>> print(fit.message)
+    the maximum number of iterations was reached before the tolerances were met; ...
     """
     method = GeometricApproximation() if method is None else method
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")

@@ -63,6 +63,18 @@ class GeneralizedCrossValidation(AbstractSmoothing):
         Lambdas tried, evenly in their logarithm over twelve decades; a parabola goes through the best three.
     rounds : int
         How often: at the first parameters, and again at those corrected on the surface found.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 3 candidates, or fewer than 1 round.
+    TypeError
+        If one of them is no number.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation(smoothing=jf.GeneralizedCrossValidation(candidates=9)).smoothing.rounds
+    2
     """
 
     candidates: int = 17
@@ -89,6 +101,23 @@ class Discrepancy(AbstractSmoothing):
         the diagonal of the data's bounding box.
     candidates, rounds : int
         As for GeneralizedCrossValidation.
+
+    Raises
+    ------
+    ValueError
+        If `noise` is negative or not finite, or there are fewer than 3 candidates or fewer than 1 round.
+    TypeError
+        If one of them is no number.
+
+    Notes
+    -----
+    V. A. Morozov, On the solution of functional equations by the method of regularization, Soviet Mathematics
+    Doklady 7, 1966.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation(smoothing=jf.Discrepancy(noise=1e-3)).smoothing.noise
+    0.001
     """
 
     noise: float

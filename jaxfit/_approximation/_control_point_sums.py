@@ -1,4 +1,4 @@
-"""The sums of Algorithm 1: how error vectors pull on control points."""
+"""`ControlPointSums`: the weighted sums of error vectors that Algorithm 1 moves control points by."""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,23 +21,35 @@ class WeightedErrors(eqx.Module):
 
     @property
     def means(self) -> Float[Array, "nu nv d"]:
-        """Weighted means of the error vectors around each control point, 0 where no point pulls."""
+        """Weighted means of the error vectors around each control point, 0 where no point has influence."""
         total = self.sums[..., -1:]
         touched = total > 0
         return jnp.where(touched, self.sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
 
 
 class ControlPointSums(PointSums):
-    """Sums `WeightedErrors` over the points at their feet.
+    """The sums `WeightedErrors` over all points, accumulated while feet are updated.
 
-    `weigh(weight, error)` says how much points count, given the lengths of their residuals; without it their
-    weights do.
+    `weigh(weight, error)` gives the weights that count, from those of the points and the lengths of their
+    residuals; without it the weights of the points count.
+
+    Notes
+    -----
+    The numerators and denominators of Algorithm 1, section 4.1 of Kineri, Wang, Lin and Maekawa (2012). Pass
+    it to `update_feet` as `sums`.
+
+    Examples
+    --------
+    >>> jf.ControlPointSums().weigh is None
+    True
+    >>> jf.ControlPointSums(lambda weight, error: weight / (1 + error)).weigh(1.0, 3.0)
+    0.25
     """
 
     weigh: Callable[[Array, Array], Array] | None = None
 
     def begin(self, pieces: Pieces) -> Float[Array, "cells K Lc"]:
-        """Moments of no points."""
+        """Zeros."""
         cells, d, order_u, order_v = pieces.coefficients.shape
         return jnp.zeros((cells, order_u, order_v * (d + 1)), pieces.coefficients.dtype)
 
@@ -50,7 +62,7 @@ class ControlPointSums(PointSums):
         e: Float[Array, "d rows width"],
         weight: Float[Array, "rows width"],
     ) -> Float[Array, "cells K Lc"]:
-        """With the moments of the points in some rows."""
+        """The total with the moments of the points in some rows added."""
         order_u, columns = total.shape[1:]
 
         def summands(e: Array, weight: Array) -> Array:
@@ -69,9 +81,9 @@ class ControlPointSums(PointSums):
 
 
 def _above_rounding(sums: Array, order: tuple[int, int]) -> Array:
-    """Sums of weights, and what goes with them, that are not so small that rounding decides them.
+    """The sums, with 0 where the sum of weights is so small that rounding decides it.
 
-    What rounds a sum is as large as those of the control points with which it shares a cell.
+    Rounding errors are as large as the sums of the control points in the same cells make them.
     """
     total = lax.stop_gradient(sums[..., -1:])
     largest = total

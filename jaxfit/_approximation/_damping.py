@@ -1,4 +1,4 @@
-"""Damped steps: how a step is judged, and how much the next one is damped."""
+"""The damping of `OrthogonalDistance`: when a step is accepted, and how much the next one is damped."""
 
 from typing import Any
 
@@ -12,21 +12,20 @@ from jaxtyping import Float, Int
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis
 
-# A step that brings less than the one share of the fall its model foresaw is damped more, beyond the other
-# the next one is damped less.
+# The ratio of the actual to the predicted reduction: below POOR the damping rises, above GOOD it falls.
 POOR, GOOD = 0.25, 0.5
 RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
-# Below its usual least value the damping is lowered only after steps that bring about all that was foreseen,
-# and take off much of the objective: so convergence is superlinear where all points can be met.
+# The damping falls below its usual minimum only after steps that achieve the predicted reduction and remove
+# much of the objective. Convergence is then superlinear where all points can be met.
 EXCELLENT, MUCH, USUAL_DAMPING, LEAST_DAMPING = 0.9, 0.5, 1e-4, 1e-12
-LONGEST_WAY = 4.0  # of a foot, in cells, in a step that brings less than GOOD
+LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 
 
 class DampingState(eqx.Module):
-    """The surface a step began from, and what it is judged by.
+    """The surface a step began from, and what decides whether it is accepted.
 
-    `damping` lies between its least value and 1, where no step can fail. `energy` is the thin plate's part of
-    the objective, `predicted` by how much the objective should fall.
+    `energy` is the thin plate's part of the objective, `predicted` the predicted reduction of the objective.
+    `damping` lies between its minimum and 1, at which no step can fail.
     """
 
     origin: WorkingSurface
@@ -37,18 +36,18 @@ class DampingState(eqx.Module):
 
 
 def first_damping(surface: WorkingSurface, dtype: Any) -> DampingState:
-    """Before anything has been measured."""
+    """The state before the first step, whose damping is 1."""
     zero, one = np.zeros((), dtype), np.ones((), dtype)
     return DampingState(surface, zero, zero, one, np.zeros((), np.int32))
 
 
-def is_plausible(state: DampingState, gain: Array, way: Array) -> Array:
-    """Whether a step in which a foot went so far did what it was to do."""
-    return (way < LONGEST_WAY) | (gain > GOOD * state.predicted) | (state.damping >= 1)
+def is_plausible(state: DampingState, gain: Array, longest_move: Array) -> Array:
+    """Whether no foot moved far, or else the reduction `gain` agrees with the prediction."""
+    return (longest_move < LONGEST_MOVE) | (gain > GOOD * state.predicted) | (state.damping >= 1)
 
 
 def next_damping(state: DampingState, before: Array, gain: Array, good: Array) -> Array:
-    """The damping of the step to come, by the fall of the objective against the fall predicted."""
+    """The damping of the next step, from the actual reduction `gain` and the predicted one."""
     superb = (gain > EXCELLENT * state.predicted) & (gain > MUCH * before)
     least = jnp.where(superb, LEAST_DAMPING, jnp.minimum(state.damping, USUAL_DAMPING))
     factor = jnp.where(gain > GOOD * state.predicted, LOWERED, 1.0)
@@ -58,7 +57,7 @@ def next_damping(state: DampingState, before: Array, gain: Array, good: Array) -
 
 
 def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Array) -> Float[Array, ""]:
-    """The longest way of a foot that counts, in widths of the cell it came from."""
+    """The longest move of a foot that counts, in widths of the cell it came from."""
     ways = []
     for axis, x, y in zip(jax.tree.map(jnp.asarray, axes), before, after, strict=True):
         ways.append(jnp.abs(y - x) / (2.0 * axis.half[axis.locate(x)]))
@@ -68,9 +67,9 @@ def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Arra
 def within_reach(
     net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"], reach: Any
 ) -> Float[Array, "nu nv d"]:
-    """Moves cut to a share of the distance to the neighbours, the nearer ones of both directions.
+    """Moves limited to a share of the distance to the nearer neighbours in the net.
 
-    A model that is linear in the control points says nothing of moves that carry a net across itself.
+    The linear model of the residuals does not hold for moves that fold the net.
     """
     length = jnp.sqrt(jnp.sum(move**2, axis=-1))
     limit = reach * jnp.minimum(_spacing(net), _spacing(net.transpose(1, 0, 2)).T)

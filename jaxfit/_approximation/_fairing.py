@@ -21,6 +21,20 @@ class Fairing(eqx.Module):
         Iterations from one fairing to the next (default 20).
     gamma : float
         At least 0 (default 2): the greater, the weaker.
+
+    Raises
+    ------
+    ValueError
+        If `every` is no whole number of at least 1, or `gamma` is negative or not finite.
+
+    Examples
+    --------
+    With gamma = 0 the interior control point becomes the mean of all nine:
+
+    >>> net, held = np.zeros((3, 3, 1)), np.zeros((3, 3), bool)
+    >>> net[1, 1] = 9.0
+    >>> jf.Fairing(gamma=0.0)(jnp.asarray(net), jnp.asarray(held))[1, 1].tolist()
+    [1.0]
     """
 
     every: int = 20

@@ -52,6 +52,14 @@ def fit_points(
         As `base_surface` and `approximate` do, and if there is no boundary.
     TypeError
         If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
+    >>> grid = np.stack([x, y, x * y], axis=2)
+    >>> fit = jf.fit_points(grid.reshape(-1, 3), jf.Boundary.from_grid(grid), net=(6, 5), max_steps=3)
+    >>> bool(fit.converged), bool(fit.average_error < 6e-4)
+    (True, True)
     """
     _check_names(options)
     check_order(order)

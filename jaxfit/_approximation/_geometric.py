@@ -1,4 +1,4 @@
-"""Geometric approximation of scattered points: Algorithm 1 of the paper (section 4.1)."""
+"""`GeometricApproximation`: Algorithm 1 of the paper (section 4.1)."""
 
 from functools import partial
 from typing import Any
@@ -28,12 +28,12 @@ from jaxfit._splines._pieces import Pieces
 
 
 class GeometricState(eqx.Module):
-    """The sums of Algorithm 1 at the last projection, what accelerates it, and where local mode works."""
+    """What the method keeps from one iteration to the next."""
 
-    sums: Float[Any, "nu nv c"]
-    momentum: Momentum | None
-    exceeded: Bool[Any, " points"] | None  # points that are, or ever were, too far away
-    extrapolation: Extrapolation | None  # where converging feet start
+    sums: Float[Any, "nu nv c"]  # of Algorithm 1, at the last projection
+    momentum: Momentum | None  # if steps are accelerated
+    exceeded: Bool[Any, " points"] | None  # in local mode: points whose error ever exceeded the tolerance
+    extrapolation: Extrapolation | None  # the last step of converged feet, from which the next ones start
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -43,53 +43,72 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     $$P_{ij} \leftarrow P_{ij} + \frac{\sum_k w_k N_i(u_k) N_j(v_k)\, e_k}{\sum_k w_k N_i(u_k) N_j(v_k)},$$
 
-    then new feet, warm-started, and so on (Algorithm 1). A control point that no data point touches stays
-    where it is. With the feet frozen this converges to the least-squares solution at their parameters
-    (section 4.2); it gets coarse features right within a few iterations and fine ones slowly.
+    then new feet, which start from the last ones, and so on (Algorithm 1). A control point that influences no
+    data point does not move. With the feet held this converges to the least-squares solution at their
+    parameters (section 4.2). Coarse features converge within a few iterations, fine ones slowly.
 
     Parameters
     ----------
     border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
         Which control points on the border of the net stay (default all of them, section 2.3 of the paper).
     relaxation : float
-        How far control points follow, as a multiple of the mean: 1.3 by default, 1 in the paper. Safe below
-        4/3, or 2 without acceleration, since the largest eigenvalue of the iteration with feet held is 1.
+        Factor on the mean (default 1.3; 1 in the paper). The iteration converges below 4/3, or below 2
+        without acceleration, since its largest eigenvalue with the feet held is 1.
     acceleration : Nesterov() or None
-        Momentum, by default Nesterov's, which takes a third of the iterations that the paper's plain steps
-        (None) do, and fewer still where many are needed.
-    foresee : bool
-        Whether feet take one step in each iteration, the residual there being foreseen to first order, rather
-        than converge (default True; False in the paper). The first and the last surface are measured at
-        converged feet all the same. Feet that converge start ahead by most of their last move, and one
-        evaluation is enough for those that are found on the second-order Taylor polynomial there and that a
-        bound on the third derivatives proves to be within the tolerance: nearly all. `foot_method` finds the
-        others.
+        Momentum (default Nesterov's; None, plain steps, in the paper). Nesterov's takes a third of the
+        iterations of plain steps, or fewer where many are needed.
+    single_step : bool
+        Whether feet take one step in each iteration instead of converging (default True; False in the paper).
+        Errors are then predicted to first order. The first and the last surface are measured exactly, at
+        converged feet. With False, feet converge in every iteration. They start from an extrapolation of
+        their last move; a Taylor bound certifies nearly all of them after one evaluation, and `foot_method`
+        finds the others.
     insertion : KnotInsertion(), optional
-        New knots every few iterations where the errors are greatest; none by default, so that the net stays
-        as it is given.
+        New knots every few iterations where the errors are greatest (default none: the net keeps its size).
     fairing : Fairing(), optional
-        Laplacian fairing of the net every few iterations (section 4.3); none by default.
+        Laplacian fairing of the net every few iterations (section 4.3; default none).
     local : bool, default False
-        Go on only where the error exceeds the tolerance on the maximum error, or where that is met or not
-        given, the tolerance on the average error (section 4.1): control points move that have influence on a
-        point which has been so far away, now or before; the others stay to the last bit, and points that do
-        not feel the move rest.
+        Whether only control points move that influence a point whose error ever exceeded the tolerance
+        (section 4.1). That is the tolerance on the maximum error or, where that is met or not given, the one
+        on the average error. The other control points keep every bit. Points whose cell did not move are not
+        projected again.
     loss : Huber(), Tukey() or GemanMcClure(), optional
-        For points with outliers, which are weighed anew in each iteration; least squares by default.
+        For data with outliers: points are reweighted in each iteration (default least squares).
     foot_method : Newton() or HuWallner()
-        How feet are brought up to date (default Newton; HuWallner in the paper).
+        The step towards a foot (default Newton; HuWallner in the paper).
     foot_tolerance : float
-        To what tangential error, as a fraction of the diagonal. The paper's results do not depend on it
-        between 1e-5 and 1e-12.
+        The largest tangential residual of a converged foot, as a fraction of the diagonal (default 1e-12).
+        The paper's results do not depend on it between 1e-5 and 1e-12.
     stall_window, stall_gain : int, float
         The fit stops as stalled when neither error has fallen by the share `stall_gain` within
-        `stall_window` iterations.
+        `stall_window` iterations (default 2e-3 within 40).
+
+    Raises
+    ------
+    ValueError
+        If `relaxation` is not positive or too large for convergence, `stall_window` is no multiple of the
+        iterations from one fairing to the next, or a number is out of range.
+    TypeError
+        If a field is of the wrong kind.
+
+    Notes
+    -----
+    Section 4 of Kineri, Wang, Lin and Maekawa (2012).
+
+    Examples
+    --------
+    >>> method = jf.GeometricApproximation()
+    >>> method.relaxation, method.acceleration, method.single_step
+    (1.3, Nesterov(), True)
+    >>> method = jf.GeometricApproximation.paper(fairing=None)
+    >>> method.relaxation, method.single_step, method.insertion.every, method.fairing
+    (1.0, False, 40, None)
     """
 
     border: AbstractBorder = FixedBorder()
     relaxation: float = 1.3
     acceleration: Nesterov | None = Nesterov()
-    foresee: bool = True
+    single_step: bool = True
     insertion: KnotInsertion | None = None
     fairing: Fairing | None = None
     local: bool = False
@@ -101,17 +120,17 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     @classmethod
     def paper(cls, **changes: Any) -> "GeometricApproximation":
-        """Section 4 as printed: plain steps, converged feet, fairing, and new knots.
+        """The method of section 4 as printed: plain steps, converged feet, fairing, and new knots.
 
-        `changes` are fields to set otherwise.
+        `changes` override single fields.
         """
-        steps = dict(relaxation=1.0, acceleration=None, foresee=False)
+        steps = dict(relaxation=1.0, acceleration=None, single_step=False)
         feet = dict(foot_method=HuWallner(), foot_tolerance=1e-8)
         return cls(**(steps | feet | dict(insertion=KnotInsertion(), fairing=Fairing()) | changes))
 
     @property
     def stall_since(self) -> int:
-        """From the first fairing on: a base surface that has not been faired may be nearer."""
+        """The first fairing: the errors of a base surface that has not been faired may be lower."""
         return 0 if self.fairing is None else self.fairing.every
 
     def __check_init__(self) -> None:
@@ -122,7 +141,7 @@ class GeometricApproximation(AbstractIterativeMethod):
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
         check_method(self)
-        check_switches(self, ("foresee", "local"))
+        check_switches(self, ("single_step", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
         if not 0 < self.relaxation < most:
@@ -138,13 +157,13 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     @property
     def finds_feet(self) -> bool:
-        """Always."""
+        """True: feet are found in every iteration."""
         return True
 
     def init(
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, GeometricState]:
-        """At rest, with room for new knots."""
+        """A surface with room for new knots, and no momentum."""
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
         net = surface.control_points
         xp: Any = np if is_concrete(net, projection) else jnp
@@ -156,11 +175,11 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     @property
     def _extrapolates(self) -> bool:
-        """Feet that converge start ahead, unless weights follow from errors and need them where feet are."""
-        return not self.foresee and self.loss is None
+        """Whether converging feet start ahead. Weights of a loss need errors at the feet themselves."""
+        return not self.single_step and self.loss is None
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
-        """Feet from the last ones, converged on the new surface or one step on, and the sums there."""
+        """New feet, converged or one step on, and the sums of Algorithm 1 there."""
         state: GeometricState = iterate.state
         pieces, before = iterate.surface.pieces, iterate.projection
         resting = ~jnp.asarray(problem.real)
@@ -179,11 +198,11 @@ class GeometricApproximation(AbstractIterativeMethod):
         if self.local:
             errors = jnp.where(problem.counted, error, 0.0) / problem.diagonal
             exceeded = exceeded | (errors > _threshold(problem, jnp.max(errors)))
-            # Sums are complete where all points were looked at, or those that feel what was touched before.
+            # Sums are complete where all points were projected, or all that influence the control point.
             after = region_of(pieces, feet.u, feet.v, exceeded)
             complete = jnp.where(exact, after.touched, region.touched)
             sums = jnp.where(complete[..., None], sums, 0.0)
-        certain = exact | (not self.foresee)
+        certain = exact | (not self.single_step)
         converged = jnp.where(certain, feet.converged, before.converged)
         here = Projection(feet.u, feet.v, error, feet.evaluations, converged, active, certain)
         return here, GeometricState(sums, state.momentum, exceeded, extrapolation)
@@ -197,8 +216,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         resting: Bool[Array, " points"],
         exact: Array,
     ) -> tuple[FootUpdate, Float[Array, "nu nv c"]]:
-        """Feet and sums. A loss weighs points by the errors of the iteration before; where these are not at
-        feet, or there are none, points are looked at twice.
+        """Feet and sums. A loss weighs points by the errors of the iteration before. Where these are not
+        errors at feet, or there are none, feet are updated twice.
         """
         u, v = before.u, before.v
         if state.extrapolation is not None:
@@ -214,7 +233,7 @@ class GeometricApproximation(AbstractIterativeMethod):
                 v,
                 self.foot_tolerance * problem.diagonal,
                 idle=resting,
-                single_step=~exact if self.foresee else False,
+                single_step=~exact if self.single_step else False,
                 sums=ControlPointSums(None if self.loss is None else weigh),
                 weight=problem.weight,
             )
@@ -223,24 +242,24 @@ class GeometricApproximation(AbstractIterativeMethod):
             feet, sums = update(u, v, before.error)
             return feet, sums.sums
 
-        def again(carry: Any) -> Any:
-            number, feet, _ = carry
+        def again(passes: Any) -> Any:
+            number, feet, _ = passes
             new, sums = update(feet.u, feet.v, feet.error)
             steps = jnp.where((number > 0) & certain, feet.evaluations, new.evaluations)
             return number + 1, eqx.tree_at(lambda f: f.evaluations, new, steps), sums.sums
 
-        certain = exact | (not self.foresee)
+        certain = exact | (not self.single_step)
         first = FootUpdate(u, v, before.error, before.evaluations, before.converged)
         begin = (jnp.where(certain, 0, 1), first, state.sums)
-        _, feet, total = lax.while_loop(lambda carry: carry[0] < 2, again, begin)
+        _, feet, total = lax.while_loop(lambda passes: passes[0] < 2, again, begin)
         return feet, total
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new one, always."""
+        """The new iterate: errors may rise on the way."""
         return new
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
-        """One step of Algorithm 1, fairing, and new knots."""
+        """One step of Algorithm 1, then fairing and new knots if it is time."""
         surface, state, step = iterate.surface, iterate.state, iterate.step + 1
         net, momentum = surface.control_points, state.momentum
         held = held_points(self.border, net.shape, surface.used)
@@ -266,11 +285,11 @@ class GeometricApproximation(AbstractIterativeMethod):
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
-        """Nothing to add."""
+        """The iterate as it is, and no statistics."""
         return iterate, {}
 
 
 def _threshold(problem: Problem, maximum: Array) -> Array:
-    """The error beyond which a point is too far away."""
+    """The error beyond which local mode goes on."""
     goal = problem.tolerances
     return jnp.where(maximum <= goal.maximum, goal.average, goal.maximum)

@@ -19,6 +19,16 @@ class JaxoptGaussNewton(AbstractLeastSquares):
         On the last step, the norm over all control points, in units of the data's extent.
     max_steps : int
         Most steps; each gains the accuracy of one CG solve, a factor of about 1e5.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        When a fit uses it and `jaxopt` is not installed.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation(solver=jf.JaxoptGaussNewton(max_steps=5)).solver.max_steps
+    5
     """
 
     tolerance: float = 1e-10
@@ -38,6 +48,16 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
         On the norm of the gradient, in units of the data's extent.
     max_steps : int
         Most steps of damping.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        When a fit uses it and `jaxopt` is not installed.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation(solver=jf.JaxoptLevenbergMarquardt()).solver.max_steps
+    60
     """
 
     tolerance: float = 1e-11

@@ -33,6 +33,16 @@ class KnotInsertion(eqx.Module):
     most : int
         Most insertions in a fit (default 16). The net has room for so many from the beginning, or for as many
         as `max_steps` permits, and a fit takes the longer, the more room.
+
+    Raises
+    ------
+    ValueError
+        If `every` is no whole number of at least 1, or `most` none of at least 0.
+
+    Examples
+    --------
+    >>> jf.GeometricApproximation(insertion=jf.KnotInsertion(every=20)).insertion
+    KnotInsertion(every=20)
     """
 
     every: int = 40

@@ -57,6 +57,11 @@ class GaussNewton(AbstractLeastSquares):
 
     The residual is linear, so that one step solves it: moments of the points within cells, one Cholesky
     factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation().solver
+    GaussNewton()
     """
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
@@ -82,6 +87,11 @@ class LevenbergMarquardt(AbstractLeastSquares):
         Relative and absolute, of the control points in units of the data's extent.
     max_steps : int
         Most steps of damping.
+
+    Examples
+    --------
+    >>> jf.StandardApproximation(solver=jf.LevenbergMarquardt()).solver.max_steps
+    60
     """
 
     tolerance: float = 1e-10

@@ -43,7 +43,7 @@ class AbstractLoss(eqx.Module):
         """rho(x) of squares of distances in units of the scale; rho(x) = x near 0."""
 
     @abstractmethod
-    def pull(self, square: Array) -> Array:
+    def derivative(self, square: Array) -> Array:
         """rho'(x), between 0 and 1."""
 
     def length(self, error: Any, real: Any, diagonal: Any) -> Float[Array, ""]:
@@ -77,6 +77,14 @@ class Huber(AbstractLoss):
     Notes
     -----
     P. J. Huber, Robust estimation of a location parameter, Ann. Math. Statist. 35, 1964.
+
+    Examples
+    --------
+    Squared distances in units of the scale: small ones count in full, larger ones linearly in the distance.
+
+    >>> loss, square = jf.Huber(), jnp.array([0.25, 4.0])
+    >>> loss.cost(square).tolist(), loss.derivative(square).tolist()
+    ([0.25, 3.0], [1.0, 0.5])
     """
 
     scale: float | None = None
@@ -86,7 +94,7 @@ class Huber(AbstractLoss):
         """x up to 1, then 2 sqrt(x) - 1."""
         return jnp.where(square <= 1, square, 2.0 * jnp.sqrt(jnp.maximum(square, 1.0)) - 1.0)
 
-    def pull(self, square: Array) -> Array:
+    def derivative(self, square: Array) -> Array:
         """1 up to 1, then 1 / sqrt(x)."""
         return 1.0 / jnp.sqrt(jnp.maximum(square, 1.0))
 
@@ -116,6 +124,11 @@ class Tukey(AbstractLoss):
     Notes
     -----
     A. E. Beaton and J. W. Tukey, Technometrics 16, 1974.
+
+    Examples
+    --------
+    >>> jf.Tukey().derivative(jnp.array([0.0, 0.5, 4.0])).tolist()
+    [1.0, 0.25, 0.0]
     """
 
     scale: float | None = None
@@ -125,7 +138,7 @@ class Tukey(AbstractLoss):
         """(1 - (1 - x)^3) / 3 up to 1, then 1/3."""
         return (1.0 - jnp.maximum(1.0 - square, 0.0) ** 3) / 3.0
 
-    def pull(self, square: Array) -> Array:
+    def derivative(self, square: Array) -> Array:
         """(1 - x)^2 up to 1, then 0."""
         return jnp.maximum(1.0 - square, 0.0) ** 2
 
@@ -147,6 +160,11 @@ class GemanMcClure(AbstractLoss):
     Notes
     -----
     S. Geman and D. E. McClure, Bull. Int. Statist. Inst. 52, 1987.
+
+    Examples
+    --------
+    >>> jf.GemanMcClure().derivative(jnp.array([0.0, 1.0, 3.0])).tolist()
+    [1.0, 0.25, 0.0625]
     """
 
     scale: float | None = None
@@ -156,7 +174,7 @@ class GemanMcClure(AbstractLoss):
         """x / (1 + x)."""
         return square / (1.0 + square)
 
-    def pull(self, square: Array) -> Array:
+    def derivative(self, square: Array) -> Array:
         """1 / (1 + x)^2."""
         return 1.0 / (1.0 + square) ** 2
 
@@ -174,7 +192,7 @@ def loss_length(loss: AbstractLoss | None, problem: Problem, error: Any) -> Any:
 
 def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:
     """How much points pull at distances `error`."""
-    return weight if loss is None else weight * loss.pull((error / length) ** 2)
+    return weight if loss is None else weight * loss.derivative((error / length) ** 2)
 
 
 def total_cost(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Float[Array, ""]:

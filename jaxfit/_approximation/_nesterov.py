@@ -41,6 +41,11 @@ class Nesterov(eqx.Module):
 
     Source: Y. Nesterov, Soviet Mathematics Doklady 27, 1983; B. O'Donoghue and E. Candes, Adaptive restart
     for accelerated gradient schemes, Foundations of Computational Mathematics 15, 2015.
+
+    Examples
+    --------
+    >>> jf.GeometricApproximation(acceleration=jf.Nesterov()).acceleration
+    Nesterov()
     """
 
     def __call__(

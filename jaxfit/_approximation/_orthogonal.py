@@ -1,4 +1,4 @@
-"""Orthogonal distance: Gauss-Newton on the true distances, with the feet eliminated."""
+"""`OrthogonalDistance`: Gauss-Newton on the true distances, with the feet eliminated."""
 
 from functools import partial
 from typing import Any
@@ -20,13 +20,13 @@ from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._second_order import second_order_rhs
-from jaxfit._approximation._smoothing import as_smoothing, check_smoothing, constant_plate, plate_of
+from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_feet
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -36,7 +36,7 @@ from jaxfit._splines._pieces import pieces_on
 
 
 class OrthogonalState(eqx.Module):
-    """lambda, how steps are damped, and the thin plate."""
+    """lambda, the damping of the steps, and the thin plate of a fit that keeps its knots."""
 
     smoothing: Float[Any, ""]
     damping: DampingState
@@ -50,30 +50,29 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     $$F = \sum_k w_k |Q_k - R(u_k^*(P))|^2 + \lambda F_s(P),$$
 
-    $F_s$ being the thin plate (10) of `StandardApproximation`. That method holds the parameters while it
-    solves, so that a point resists every move of the surface; here it resists only moves along the normal
-    $n_k$, and the net is free to slide to where the detail is. Each step solves
+    $F_s$ being the thin-plate energy (10) of `StandardApproximation`. That method holds the parameters while
+    it solves, so that a point resists every move of the surface. Here a point resists only moves along the
+    normal $n_k$; the net may slide along the surface. Each step solves
 
     $$\Big(\sum_k w_k B_k^T (\Pi_k + \mu (I - \Pi_k)) B_k + \lambda A_{fair}\Big)\, \delta P
       = \sum_k w_k B_k^T (Q_k - R_k) - \lambda A_{fair} P,$$
 
     with the basis functions $B_k$ at the foot and the projection $\Pi_k$ on the normal space, for a surface
-    in space $n_k n_k^T$. At a foot on the border of the domain only those tangent directions are taken off in
-    which it is free to move. These rows are the exact derivative of the residual in the normal
-    space, whatever the curvature; what is left out lies in the tangent space and is of second order in the
+    in space $n_k n_k^T$. At a foot on the border of the domain $\Pi_k$ removes only the tangent directions in
+    which the foot is free to move. These rows are the exact derivative of the residual in the normal space,
+    whatever the curvature. The part left out lies in the tangent space and is of second order in the
     distances.
 
-    Where the net slides along the surface the distances change to second order only. So the step is followed
-    by its correction, which solves the same system for the second derivatives of the residuals along it
-    (geodesic acceleration), at the same feet and at most 0.75 times as long as the step.
+    Where the net slides along the surface the distances change to second order only. So each step gets a
+    correction (geodesic acceleration): the solution of the same system for the second derivatives of the
+    residuals along the step, at the same feet and at most 0.75 times as long as the step.
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
-    the distance at the old parameters is at least the new one. The first step has mu = 1; after it mu
-    follows the fall of F against the one foreseen. A step after which F, measured at converged feet, has
-    not fallen is taken back, so that F never rises; so is one in which a foot has moved by several cells
-    without the fall that was foreseen. It counts as an iteration, with the errors of the surface it went
-    back to. F is judged at the feet that the fit follows; the errors it gives back are searched for anew on
-    the whole surface.
+    the distance at the old parameters is at least the new one. The first step has mu = 1. After it mu
+    follows the ratio of the actual to the predicted reduction of F. A step is rejected if F, measured at
+    converged feet, has not fallen; so F never rises. It is also rejected if a foot has moved by several cells
+    and the reduction is less than predicted. A rejected step counts as an iteration, with the errors of the
+    surface before it. F is measured at local feet.
 
     Parameters
     ----------
@@ -82,39 +81,50 @@ class OrthogonalDistance(AbstractIterativeMethod):
     border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
         Which control points on the border of the net stay (default all of them, section 2.3 of the paper).
     insertion : KnotInsertion(), optional
-        New knots every few iterations where the errors are greatest; none by default.
+        New knots every few iterations where the errors are greatest (default none).
     loss : Huber(), Tukey() or GemanMcClure(), optional
-        For points with outliers; least squares by default.
+        For data with outliers (default least squares).
     damping : float
         mu of the second step, in (0, 1] (default 0.01).
     reach : float
-        Most that a control point moves in a step with mu below 1, correction included, as a share of the
+        The longest move of a control point in a step with mu below 1, correction included, as a share of the
         distance to its neighbours (default 0.6).
     foot_method, foot_tolerance, stall_window, stall_gain
-        As for GeometricApproximation.
+        As for GeometricApproximation (defaults Newton(), 1e-12, 20, 2e-3).
 
     Raises
     ------
     ValueError
         If `smoothing` is negative or not finite, `damping` not in (0, 1], or `reach` not positive.
+    TypeError
+        If a field is of the wrong kind.
 
     Notes
     -----
-    The fit's `stats` say `smoothing`; `bending_energy`, $F_s$ in the squared unit of the data; `damping`, the
-    last mu; and `rejected_steps`, how many were taken back.
+    The fit's `stats` contain `smoothing`; `bending_energy`, $F_s$ in the squared unit of the data; `damping`,
+    the last mu; and `rejected_steps`, the number of rejected steps.
 
-    Far from the points the feet say little, and like the paper's methods this one may fold a surface whose
-    base is too far away, or whose net is too coarse for what it is asked; a base made with the points
-    (`Meshless`, `DynamicBaseSurface`) or a finer net is the remedy. Where smoothing is 0, control points that
-    few points see may travel far.
+    Like the paper's methods this one may fold a surface whose base is too far from the points, or whose net
+    is too coarse. A base made with the points (`Meshless`, `DynamicBaseSurface`) or a finer net is the
+    remedy. Where smoothing is 0, control points that influence few points may move far.
 
     This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
-    2006. The correction is that of Transtrum and Sethna (arXiv:1201.5885). It runs in the loop of all fits
-    rather than in an optimistix solver: the objective is known only when feet have been found, these are
-    taken back together with the net, and nets grow, for which the latter has no place. Given the residual
-    `points - closest_point(surface, points).point`, whose derivative is implicit, `optimistix.least_squares`
-    comes to the same minimum, with dense Jacobians or many passes over the points.
+    2006. The correction is that of Transtrum and Sethna (arXiv:1201.5885). The method runs in the loop of all
+    fits rather than in an optimistix solver, because the objective needs feet, which are restored together
+    with the net after a rejected step, and because nets grow. `optimistix.least_squares` on the residual
+    `points - closest_point(surface, points).point` comes to the same minimum, with dense Jacobians or many
+    passes over the points.
+
+    Examples
+    --------
+    >>> method = jf.OrthogonalDistance(loss=jf.Huber(), border=jf.FixedCorners())
+    >>> method.smoothing, method.damping, method.reach
+    (5e-06, 0.01, 0.6)
+    >>> jf.OrthogonalDistance(damping=2.0)
+    Traceback (most recent call last):
+    ...
+    ValueError: damping must be greater than 0 and at most 1, but is 2.0; the default is 0.01.
     """
 
     smoothing: Any = 5e-6
@@ -145,25 +155,25 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     @property
     def stall_since(self) -> int:
-        """From the first iteration on."""
+        """The first iteration."""
         return 0
 
     @property
     def finds_feet(self) -> bool:
-        """Always."""
+        """True: feet are found in every iteration."""
         return True
 
     def init(
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, OrthogonalState]:
-        """Undamped steps cannot fail, so the first is one."""
+        """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
         plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
         smoothing = as_smoothing(self.smoothing, dtype)
         return surface, OrthogonalState(smoothing, first_damping(surface, dtype), plate)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
-        """Feet from the last accepted ones, and the energy of the surface."""
+        """Converged feet, starting from the last accepted ones, and the thin-plate energy."""
         surface, state = iterate.surface, iterate.state
         here = measure_feet(
             self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
@@ -172,18 +182,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
         return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The surface just measured if its objective is lower, or the one before."""
+        """The new iterate if its objective is lower, otherwise the old surface."""
         state: DampingState = new.state.damping
         here, before = new.projection, old.projection
         weight = problem.weight
-        # Both surfaces are judged by one scale of the loss.
+        # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        worth = total_cost(self.loss, length, weight, before.error) + old.state.damping.energy
-        gain = worth - total_cost(self.loss, length, weight, here.error) - state.energy
-        ways = (before.u, before.v), (here.u, here.v)
-        way = farthest_move(new.surface.axes, *ways, problem.counted)
-        good = (gain > 0) & is_plausible(state, gain, way)
-        damping = jnp.where(new.step == 1, self.damping, next_damping(state, worth, gain, good))
+        objective = total_cost(self.loss, length, weight, before.error) + old.state.damping.energy
+        gain = objective - total_cost(self.loss, length, weight, here.error) - state.energy
+        feet = (before.u, before.v), (here.u, here.v)
+        longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
+        good = (gain > 0) & is_plausible(state, gain, longest_move)
+        damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, good))
         origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
         kept = lax.cond(
             good,
@@ -193,13 +203,13 @@ class OrthogonalDistance(AbstractIterativeMethod):
         surface, projection, energy = kept
         projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
         rejected = state.rejected_steps + ~good
-        judged = DampingState(surface, energy, state.predicted, damping, rejected)
+        damped = DampingState(surface, energy, state.predicted, damping, rejected)
         return Iterate(
-            surface, projection, OrthogonalState(new.state.smoothing, judged, new.state.plate), new.step
+            surface, projection, OrthogonalState(new.state.smoothing, damped, new.state.plate), new.step
         )
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
-        """New knots, and a step to be judged once it has been measured."""
+        """New knots if it is time, and a step that `accept` decides on once it has been measured."""
         here, damping = iterate.projection, iterate.state.damping
         surface = self._refined(problem, iterate)
         net, axes = surface.control_points, surface.axes
@@ -226,12 +236,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
             correction_rhs,
         )
         following, predicted = materialise(always, solve, equations, net, held, damping.damping)
-        judged = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
-        state = OrthogonalState(iterate.state.smoothing, judged, iterate.state.plate)
+        damped = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
+        state = OrthogonalState(iterate.state.smoothing, damped, iterate.state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
     def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
-        """The accepted surface with new knots if it is time: it is the same surface, and so are its feet."""
+        """The accepted surface, with new knots if it is time; they change neither it nor its feet."""
         if self.insertion is None:
             return iterate.surface
         refine = partial(self.insertion, projection=iterate.projection, counted=problem.counted)
@@ -242,7 +252,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
-        """lambda, the integral (10), and how the steps went."""
+        """The iterate as it is; lambda, the integral (10), the last damping and the rejected steps."""
         state, surface = iterate.state, iterate.surface
         energy = plate_of(state.plate, surface).energy(surface.control_points)
         return iterate, {

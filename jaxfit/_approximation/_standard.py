@@ -1,4 +1,4 @@
-"""Standard approximation of scattered points: section 2.3 of the paper, equations (8) to (11)."""
+"""`StandardApproximation`: least squares with a thin plate, equations (8) to (11) of the paper."""
 
 from typing import Any
 
@@ -12,13 +12,13 @@ from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
-from jaxfit._approximation._smoothing import as_smoothing, check_smoothing, constant_plate, plate_of
+from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._cells import values_at
 from jaxfit._checks import check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_feet
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -27,7 +27,7 @@ from jaxfit._normal_equations import RegularisedSystem, ThinPlate, make_system
 
 
 class StandardState(eqx.Module):
-    """lambda, by what share of its diagonal a singular matrix was shifted at most, and the thin plate."""
+    """lambda, the largest shift of a singular matrix (a share of its diagonal), and the thin plate."""
 
     smoothing: Float[Any, ""]
     shift: Float[Any, ""]
@@ -42,42 +42,52 @@ class StandardApproximation(AbstractIterativeMethod):
     $$F = \sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda \int_0^1\!\!\int_0^1
         |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2 \, du\, dv,$$
 
-    equations (8) and (10), then takes the closest points on the new surface as parameters, and so on. The
-    domain counts as $[0, 1]^2$; lambda has no unit, and weighs against a plain sum over the points. Control
-    points that neither data nor smoothing reaches, or hardly, stay where they are; without smoothing those
-    that few points see may travel far.
+    equations (8) and (10). Then the parameters of the closest points on the new surface replace the old ones,
+    and so on. The domain counts as $[0, 1]^2$; lambda has no unit. Control points that neither data nor
+    smoothing determines do not move. Without smoothing, control points that influence few points may move
+    far.
 
     Parameters
     ----------
     smoothing : float, GeneralizedCrossValidation() or Discrepancy(noise)
         lambda (default 2e-5, the paper's for two of its three models); 0 for none. May be traced. An object
-        chooses it from the data before the iteration begins.
+        chooses lambda from the data before the iteration begins.
     parameter_correction : bool
-        False solves once, at the parameters given as `start` or found on the base surface. The loop then
-        measures errors at these parameters; the errors of the fit are at true closest points nevertheless.
+        Whether parameters are corrected (default True). False solves once, at the parameters given as `start`
+        or found on the base surface, and the history records errors at these parameters.
     border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
         Which control points on the border of the net stay (default all of them, section 2.3).
     solver : GaussNewton(), LevenbergMarquardt(), JaxoptGaussNewton() or JaxoptLevenbergMarquardt()
         How the least-squares problem is solved (default GaussNewton, direct). All agree to rounding.
     insertion : KnotInsertion(), optional
-        New knots every few rounds where the errors are greatest; none by default.
+        New knots every few iterations where the errors are greatest (default none).
     loss : Huber(), Tukey() or GemanMcClure(), optional
-        For points with outliers, which are weighed anew in each round; least squares by default.
+        For data with outliers: points are reweighted in each iteration (default least squares).
     foot_method, foot_tolerance, stall_window, stall_gain
-        As for GeometricApproximation.
+        As for GeometricApproximation (defaults Newton(), 1e-12, 20, 2e-3).
 
     Raises
     ------
     ValueError
         If `smoothing` is negative or not finite.
+    TypeError
+        If a field is of the wrong kind.
 
     Notes
     -----
-    The fit's `stats` say `smoothing`, the lambda in force; `bending_energy`, the integral above in the
-    squared unit of the data; and `shift`, by what share of its diagonal a normal matrix had to be shifted
-    because it was nearly singular, as it is without smoothing where points are fewer than a net needs: 0 for
-    a regular one. What is solved for is the correction of the present surface, so that what the data leaves
-    open stays as it is.
+    The fit's `stats` contain `smoothing`, the lambda in force; `bending_energy`, the integral above in the
+    squared unit of the data; and `shift`. A normal matrix that is nearly singular is shifted by this share of
+    its diagonal; 0 for a regular one. It is singular without smoothing where the points are too few for the
+    net. The system is solved for the correction of the present surface, so that whatever the data does not
+    determine does not change.
+
+    Examples
+    --------
+    >>> method = jf.StandardApproximation(smoothing=1e-6, insertion=jf.KnotInsertion())
+    >>> method.finds_feet, method.border, method.solver
+    (True, FixedBorder(), GaussNewton())
+    >>> jf.StandardApproximation(parameter_correction=False).finds_feet
+    False
     """
 
     smoothing: Any = 2e-5
@@ -107,12 +117,12 @@ class StandardApproximation(AbstractIterativeMethod):
 
     @property
     def finds_feet(self) -> bool:
-        """Whether parameters are corrected, and so are foot points."""
+        """Whether parameters are corrected: they are then those of foot points."""
         return self.parameter_correction
 
     @property
     def stall_since(self) -> int:
-        """From the first iteration on."""
+        """The first iteration."""
         return 0
 
     def init(
@@ -129,7 +139,7 @@ class StandardApproximation(AbstractIterativeMethod):
         return surface, StandardState(smoothing, xp.zeros_like(smoothing), plate)
 
     def held(self, surface: WorkingSurface) -> Bool[Any, "nu nv"]:
-        """Which control points stay."""
+        """Control points that do not move."""
         return held_points(self.border, surface.control_points.shape, surface.used)
 
     def system(
@@ -147,7 +157,7 @@ class StandardApproximation(AbstractIterativeMethod):
         return make_system(surface.pieces, *parameters, problem.target, weight, smoothing, plate)
 
     def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
-        """New parameters, or the errors at the old ones."""
+        """Feet on the new surface, or without correction the errors at the same parameters."""
         if self.parameter_correction:
             return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
         idle = ~jnp.asarray(problem.real)
@@ -157,15 +167,15 @@ class StandardApproximation(AbstractIterativeMethod):
         return Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
-        """Feet, or the errors at held parameters."""
+        """Feet, or without correction the errors at the same parameters."""
         return self.project(problem, iterate.surface, iterate.projection), iterate.state
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new one, always."""
+        """The new iterate: errors may rise on the way."""
         return new
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
-        """The net of least squares at the present parameters, and new knots."""
+        """The least-squares net at the present parameters, then new knots if it is time."""
         surface, here, state = iterate.surface, iterate.projection, iterate.state
         system = self.system(problem, surface, here, state.smoothing, state.plate)
         net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
@@ -178,7 +188,7 @@ class StandardApproximation(AbstractIterativeMethod):
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
-        """lambda, the integral (10), and the largest shift."""
+        """The iterate as it is; lambda, the integral (10), and the largest shift."""
         energy = plate_of(iterate.state.plate, iterate.surface).energy(iterate.surface.control_points)
         stats = {"bending_energy": energy * problem.scale**2}
         return iterate, stats | {"smoothing": iterate.state.smoothing, "shift": iterate.state.shift}

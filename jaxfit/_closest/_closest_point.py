@@ -29,7 +29,13 @@ from jaxfit._splines._pieces import as_surface_arrays, make_axis
 
 
 class PointStatus(enum.IntEnum):
-    """Where a foot point lies, or that it was not found; `ClosestPoint.status` holds these numbers."""
+    """Where a foot point lies, or that it was not found; `ClosestPoint.status` holds these numbers.
+
+    Examples
+    --------
+    >>> jf.PointStatus(1).name
+    'BORDER'
+    """
 
     INTERIOR = 0
     BORDER = 1
@@ -54,6 +60,15 @@ class ClosestPoint(eqx.Module):
         A `PointStatus` each.
     steps : array (points,) of int
         Evaluations of the surface spent on each point.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.BSplineSurface(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> found = jf.closest_point(square, np.array([[0.25, 0.5, 2.0], [3.0, 0.5, 0.0]]))
+    >>> found.point.shape, found.status.tolist() == [jf.PointStatus.INTERIOR, jf.PointStatus.BORDER]
+    ((2, 3), True)
     """
 
     u: Float[Array, " points"]
@@ -127,6 +142,15 @@ def closest_point(
     Outside transformations sizes are padded to one of four per octave, so that clouds of similar size
     share one compilation. On a CPU, clouds of more than 65,536 points are cut into parts of one size, a
     thread for each core.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.BSplineSurface(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> found = jf.closest_point(square, np.array([[0.25, 0.5, 2.0], [3.0, 0.5, 0.0]]))
+    >>> np.round(found.u, 3).tolist(), np.round(found.v, 3).tolist(), np.round(found.distance, 3).tolist()
+    ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
     method = Newton() if method is None else method
     check_kind("surface", surface, (BSplineSurface, BSplineCurve), "BSplineSurface(...)")

@@ -44,6 +44,11 @@ class Newton(AbstractFootMethod):
 
     Converges quadratically. The safeguard around it halves every step that would increase the
     distance.
+
+    Examples
+    --------
+    >>> jf.OrthogonalDistance().foot_method
+    Newton()
     """
 
     drift: ClassVar[bool] = False
@@ -72,6 +77,11 @@ class HuWallner(AbstractFootMethod):
     from the second-order expansion of the section. Written with inner products only, so for any
     dimension. Close to the centre of curvature and beyond it, where that foot jumps to the far side of the
     circle, it takes Newton's step.
+
+    Examples
+    --------
+    >>> jf.GeometricApproximation.paper().foot_method
+    HuWallner()
     """
 
     drift: ClassVar[bool] = True

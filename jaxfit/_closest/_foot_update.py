@@ -50,6 +50,17 @@ def update_feet(
 
     Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
     \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.WorkingSurface.of(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> target, start = jnp.array([[0.25, 3.0], [0.5, 0.5], [2.0, 0.0]]), jnp.array([0.5, 0.5])
+    >>> idle, tolerance = jnp.array([False, False]), jnp.asarray(1e-5)
+    >>> feet, _ = jf.update_feet(jf.Newton(), square.pieces, target, start, start, tolerance, idle=idle)
+    >>> np.round(feet.u, 3).tolist(), np.round(feet.v, 3).tolist(), np.round(feet.error, 3).tolist()
+    ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
     pieces = in_precision_of(target, pieces)
     limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)

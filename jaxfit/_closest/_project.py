@@ -18,7 +18,9 @@ Border = tuple[Array, Array, Array, Array]  # low_u, high_u, low_v, high_v: of a
 def in_precision_of(target: Array, pieces: Pieces) -> Pieces:
     """The pieces as arrays of the target's floating type; knots may come with another."""
     arrays = jax.tree.map(jnp.asarray, pieces)
-    return jax.tree.map(lambda x: x.astype(target.dtype) if jnp.issubdtype(x, jnp.floating) else x, arrays)
+    return jax.tree.map(
+        lambda x: x.astype(target.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, arrays
+    )
 
 
 def initial_feet(

@@ -101,7 +101,13 @@ class FixedSides(AbstractBorder):
 
 
 def held_points(border: AbstractBorder, shape: tuple[int, ...], used: Any) -> Bool[Any, "nu nv"]:
-    """The control points that `border` holds, and surplus ones; `used` (2,) are those in use."""
+    """The control points that `border` holds, and surplus ones; `used` (2,) are those in use.
+
+    Examples
+    --------
+    >>> jf.held_points(jf.FixedCorners(), (3, 3), np.array([3, 3])).astype(int).tolist()
+    [[1, 0, 1], [0, 0, 0], [1, 0, 1]]
+    """
     xp: Any = np if is_concrete(used) else jnp
     number = [xp.arange(n) for n in shape[:2]]
     ends = [xp.stack([n == 0, n == used[k] - 1]) for k, n in enumerate(number)]

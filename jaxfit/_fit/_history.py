@@ -22,6 +22,13 @@ class ErrorHistory(eqx.Module):
     Rows of `errors`: average and maximum error as fractions of the diagonal, evaluations of the surface for a
     foot, and change of its parameters since the iteration before, both on average. Rows of `counts`: points
     that took part, and control points along u and v.
+
+    Examples
+    --------
+    >>> history = jax.tree.map(jnp.asarray, jf.ErrorHistory.empty(max_steps=10, dtype=np.float32))
+    >>> history = history.append(jnp.asarray(0), (0.5, 1.0, 3.0, 0.0), jnp.array([60, 6, 5], jnp.int32))
+    >>> history.at(jnp.asarray(0)).tolist()
+    [0.5, 1.0, 3.0, 0.0]
     """
 
     errors: Float[Any, "4 steps"]
@@ -88,6 +95,13 @@ class History(eqx.Module):
     -----
     The last 65,536 iterations are kept. Inside a transformation, where the number of iterations is not known,
     the arrays have room for more, and end in NaN.
+
+    Examples
+    --------
+    >>> errors, none = jnp.array([0.02, 0.005]), jnp.zeros(2)
+    >>> history = jf.History(average=errors, maximum=3 * errors, evaluations=none, change=none)
+    >>> round(float(history.average[0] / history.average[-1]), 3)
+    4.0
     """
 
     average: Float[Array, " steps"]

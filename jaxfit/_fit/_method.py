@@ -21,6 +21,16 @@ class Iterate(eqx.Module):
     """A surface, the points projected onto it, the method's state, and how many moves led there.
 
     Before it is measured, `projection` is that of the iterate before.
+
+    Examples
+    --------
+    >>> u, none = jnp.array([0.25, 0.5]), jnp.zeros(2, jnp.int32)
+    >>> projection = jf.Projection(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> surface = jf.WorkingSurface.of(np.zeros((2, 2, 3)), knots, knots)
+    >>> iterate = jf.Iterate(surface, projection, state=(), step=jnp.asarray(0))
+    >>> iterate.surface.order, int(iterate.step)
+    ((2, 2), 0)
     """
 
     surface: WorkingSurface
@@ -51,6 +61,15 @@ class AbstractIterativeMethod(eqx.Module):
     stall_window, stall_gain : int, float
         The fit stops as stalled when neither error has fallen by the share `stall_gain` within
         `stall_window` iterations.
+
+    Examples
+    --------
+    All iterative methods of this library are subclasses. `tests/test_method_contract.py` has a complete
+    method written from public names alone.
+
+    >>> method = jf.GeometricApproximation()
+    >>> isinstance(method, jf.AbstractIterativeMethod), method.stall_window, method.finds_feet
+    (True, 40, True)
     """
 
     stall_window: eqx.AbstractVar[int]

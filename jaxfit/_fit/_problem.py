@@ -38,6 +38,13 @@ class Problem(eqx.Module):
     scale : array ()
         The unit of the problem, in the user's unit.
     tolerances : Tolerances
+
+    Examples
+    --------
+    The loop passes it to the functions of a method; `problem.counted` and `problem.summarise` follow from:
+
+    >>> list(jf.Problem.__dataclass_fields__)
+    ['target', 'weight', 'real', 'diagonal', 'scale', 'tolerances']
     """
 
     target: Float[Any, "d points"]

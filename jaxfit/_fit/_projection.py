@@ -23,6 +23,13 @@ class Projection(eqx.Module):
         How many points took part in what the method does next.
     exact : array () of bool
         False where errors are predictions. The loop measures once more, exactly, before it stops.
+
+    Examples
+    --------
+    >>> u, none = jnp.array([0.25, 0.5]), jnp.zeros(2, jnp.int32)
+    >>> projection = jf.Projection(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
+    >>> projection.u.shape, int(projection.active), bool(projection.converged.all())
+    ((2,), 2, True)
     """
 
     u: Float[Any, " points"]

@@ -9,7 +9,13 @@ from jaxfit._checks import is_concrete
 
 
 class RESULTS(eqx.Enumeration):
-    """Why a fit stopped. Compare with `fit.result == RESULTS.converged`."""
+    """Why a fit stopped. Compare with `fit.result == RESULTS.converged`.
+
+    Examples
+    --------
+    >>> print(jf.RESULTS[jf.RESULTS.converged])
+    all tolerances are met.
+    """
 
     running = "the fit has not finished."
     converged = "all tolerances are met."

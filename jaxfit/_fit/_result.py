@@ -44,6 +44,15 @@ class Fit(eqx.Module):
         interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
         Other entries stand with the methods that add them.
+
+    Examples
+    --------
+    The shapes of a fit, found without computing it:
+
+    >>> grid = np.zeros((6, 5, 3))
+    >>> fit = jax.eval_shape(lambda grid: jf.interpolate(grid, jf.StandardInterpolation()), grid)
+    >>> fit.surface.control_points.shape, fit.errors.shape, fit.average_error.shape
+    ((6, 5, 3), (6, 5), ())
     """
 
     surface: BSplineSurface

@@ -18,6 +18,13 @@ class WorkingSurface(eqx.Module):
 
     A surface that gets more knots on the way has room for them: surplus control points behind the last one in
     use, and as many repeats of the last knot. Neither has any influence.
+
+    Examples
+    --------
+    >>> net, knots_u = np.zeros((5, 3, 3)), jf.clamped_uniform_knots(5, 4)
+    >>> surface = jf.WorkingSurface.of(net, np.asarray(knots_u), np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
+    >>> surface.order, surface.used.tolist(), surface.padded(room=2).control_points.shape
+    ((4, 3), [5, 3], (7, 5, 3))
     """
 
     control_points: Float[Any, "nu nv d"]

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from jaxfit._closest import Border
 from jaxfit._closest._implicit import foot_change
 from jaxfit._fit._border import corners
-from jaxfit._fit._measure import side_bounds
+from jaxfit._fit._feet import side_bounds
 from jaxfit._interpolation._point_collocation import PointCollocation, at_cells, control_point_windows
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
 from jaxfit._interpolation._solution_derivative import with_derivative

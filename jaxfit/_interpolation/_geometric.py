@@ -12,8 +12,8 @@ from jaxtyping import Float
 from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
+from jaxfit._fit._feet import measure_grid, side_bounds
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import measure_grid, side_bounds
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection

@@ -8,8 +8,8 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest import Newton, project
+from jaxfit._fit._feet import FOOT_STEPS
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._measure import FOOT_STEPS
 from jaxfit._interpolation._gmres import Limits, append_errors, distances, gmres_solve
 from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._solution_derivative import times_last

@@ -39,6 +39,14 @@ def curvature_energy(surface: BSplineSurface, points: int = 6) -> Float[Array, "
     Notes
     -----
     Equation (9) of Kineri, Wang, Lin and Maekawa (2012). Points where the surface has no normal count as 0.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid([0.0, 1.0], [0.0, 1.0], indexing="ij")
+    >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
+    >>> square = jf.BSplineSurface(np.stack([x, y, 0 * x], axis=2), knots, knots)
+    >>> float(jf.curvature_energy(square))
+    0.0
     """
     if surface.dimension != 3:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The thin plate of a fit, and lambda, its weight."""
+"""The smoothing term of the least-squares fits: the thin plate, and lambda, its weight."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ def plate_of(constant: ThinPlate | None, surface: WorkingSurface) -> ThinPlate:
 
 
 def as_smoothing(smoothing: Any, dtype: Any) -> Any:
-    """lambda as an array; a traced one that is none becomes NaN, with which no step is finite."""
+    """lambda as an array. A traced one that is negative or not finite becomes NaN, and the fit diverges."""
     if is_concrete(smoothing):
         return np.asarray(smoothing, dtype)
     value = jnp.asarray(smoothing, dtype)
