@@ -22,8 +22,7 @@ jax.config.update("jax_enable_x64", True)
 import closest_reference
 import helpers
 
-from jaxfit import BSplineSurface, HuWallner, Newton, closest_point
-from jaxfit._base import Boundary, base_surface
+import jaxfit as jf
 
 BASES = {"blade_wrap_3000": (24, 40), "mannequin_head": (42, 42)}
 
@@ -68,19 +67,19 @@ def verdict(surface, points, feet, expected=None):
 def wavy(count, runs):
     """The figures for a wavy 42 x 42 surface, and where the time goes."""
     knots = helpers.clamped_uniform(42, 4)
-    surface = BSplineSurface(helpers.wavy_net(42, 42), knots, knots)
+    surface = jf.BSplineSurface(helpers.wavy_net(42, 42), knots, knots)
     points, u, v = off_surface(surface, count)
-    *times, feet = timed(lambda: closest_point(surface, points), runs)
+    *times, feet = timed(lambda: jf.closest_point(surface, points), runs)
     expected = closest_reference.nearest_distance(surface, points)
     line("wavy 42x42, cold", count, *times, verdict(surface, points, feet, expected))
     shift = np.random.default_rng(1).uniform(-0.01, 0.01, (2, count))
     start = (u + shift[0], v + shift[1])
-    for method in (Newton(), HuWallner()):
-        *times, feet = timed(lambda m=method: closest_point(surface, points, start, m), runs)
+    for method in (jf.Newton(), jf.HuWallner()):
+        *times, feet = timed(lambda m=method: jf.closest_point(surface, points, start, m), runs)
         lost = int((~np.asarray(feet.converged)).sum())
         line(f"wavy 42x42, warm, {type(method).__name__}", count, *times, f"{lost} not converged")
     on_device = jax.device_put((points, *start))
-    *times, _ = timed(lambda: closest_point(surface, on_device[0], on_device[1:]), runs)
+    *times, _ = timed(lambda: jf.closest_point(surface, on_device[0], on_device[1:]), runs)
     line("wavy 42x42, warm, arrays on device", count, *times)
 
 
@@ -92,13 +91,13 @@ def bases(folder, runs):
             print(f"{name}: not in {folder}, left out")
             continue
         data = np.load(path)
-        sides = Boundary(*(data[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
-        base = base_surface(sides, data["points"], net=net)
+        sides = jf.Boundary(*(data[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
+        base = jf.base_surface(sides, data["points"], net=net)
         near, _, _ = off_surface(base, 20_000)
         box = data["points"].min(axis=0), data["points"].max(axis=0)
         around = np.random.default_rng(4).uniform(*box, (5_000, 3))
         for kind, points in (("cloud", data["points"]), ("1-5 % off", near), ("box", around)):
-            *times, feet = timed(lambda q=points, s=base: closest_point(s, q), runs)
+            *times, feet = timed(lambda q=points, s=base: jf.closest_point(s, q), runs)
             line(f"{name}, {kind}", len(points), *times, verdict(base, points, feet))
 
 

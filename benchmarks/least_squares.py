@@ -2,25 +2,26 @@
 
     python benchmarks/least_squares.py [--turns 7] [--case 0 1 2]
 
-Median times with the lowest and the highest, after the first call, which compiles. Both get points and
-parameters on a uniform net whose border control points are held, and give control points. The root mean
-square distance from the points follows, and the memory: ours what the compiled computation holds at most, its
-inputs included, SciPy's what its arrays take at most beyond them. Ours is timed through optimistix, as
-`StandardApproximation` solves it, and bare: moments, factors, one solve. Without scikit-sparse SciPy's own
-`splu` takes CHOLMOD's part. They take turns, so that both meet the same machine.
+Both are called as a user would: NumPy arrays of points, parameters and knots go in, and a NumPy array of
+control points comes out, all of them free. Ours is one public call, which also checks its arguments and
+measures the errors at the parameters. SciPy's takes `NdBSpline.design_matrix`, the normal matrix, and
+CHOLMOD of scikit-sparse with its analysis of the pattern; where that is missing, SciPy's own `splu`. The thin
+plate's matrix is given to it. They take turns, so that both meet the same machine.
+
+Printed are the median times with the lowest and the highest, the first call, which compiles, the ratio of
+the medians, and the largest difference of the control points as a fraction of the diagonal of the cloud's
+bounding box.
 """
 
 import argparse
 import sys
 import time
-import tracemalloc
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
-from scipy.interpolate import BSpline
+from scipy.interpolate import NdBSpline
 from scipy.sparse.linalg import splu
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / x) for x in ("", "tests")]
@@ -29,10 +30,7 @@ jax.config.update("jax_enable_x64", True)
 import helpers
 from normal_reference import squares
 
-from jaxfit._approximation._least_squares import GaussNewton, StructuredSolver, least_squares_problem
-from jaxfit._fit._measure import border
-from jaxfit._normal_equations import make_system
-from jaxfit._splines._pieces import make_pieces
+import jaxfit as jf
 
 try:
     from sksparse.cholmod import cholesky
@@ -50,121 +48,83 @@ def cloud(count):
     return u, v, np.stack([u + 0.05 * np.sin(5 * v), v, z], axis=-1)
 
 
-@jax.jit
-def through_optimistix(pieces, net, u, v, points, smoothing):
-    return GaussNewton()(_posed(pieces, net, u, v, points, smoothing))[0]
+def flat_net(knots):
+    """Control points (nu, nv, 3) of the unit square in the plane z = 0."""
+    greville = (np.convolve(k[1:-1], np.ones(3) / 3, "valid") for k in knots)
+    x, y = np.meshgrid(*greville, indexing="ij")
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
 
 
-@jax.jit
-def bare(pieces, net, u, v, points, smoothing):
-    problem = _posed(pieces, net, u, v, points, smoothing)
-    return net - StructuredSolver(problem).compute(StructuredSolver.Side(), problem.residual(net), {})[0]
+def ours(knots, net, u, v, points, smoothing):
+    """The public call, which solves once: no surface meets a tolerance of 0."""
+    method = jf.StandardApproximation(smoothing, parameter_correction=False, border=jf.FreeBorder())
+    base = jf.BSplineSurface(net, *knots)
+    options = dict(start=(u, v), tol_average=0.0, max_steps=1, errors=jf.AtParameters())
+    return np.asarray(jf.approximate(points, base, method, **options).surface.control_points)
 
 
-def _posed(pieces, net, u, v, points, smoothing):
-    system = make_system(pieces, u, v, points.T, jnp.ones_like(u), smoothing)
-    return least_squares_problem(system, border(*net.shape[:2], corners_only=False), net)
+def scipys(knots, shape, u, v, points, plate):
+    """The design matrix, the normal matrix, and a sparse Cholesky factorisation."""
+    a = NdBSpline.design_matrix(np.stack([u, v], axis=-1), knots, 3)
+    matrix = a.T @ a if plate is None else a.T @ a + plate
+    solve = cholesky(matrix.tocsc()) if cholesky else splu(matrix.tocsc()).solve
+    return solve(a.T @ points).reshape(shape)
 
 
-def scipy_solve(knots, net, u, v, points, plate):
-    """Design matrix row by row, the normal matrix, and a sparse Cholesky factorisation."""
-    nu, nv, _ = net.shape
-    along_u, along_v = (BSpline.design_matrix(x, t, 3) for x, t in zip((u, v), knots, strict=True))
-    first_u, first_v = (a.indices.reshape(-1, 4) for a in (along_u, along_v))
-    index = (first_u[:, :, None] * nv + first_v[:, None, :]).reshape(-1)
-    data = (along_u.data.reshape(-1, 4, 1) * along_v.data.reshape(-1, 1, 4)).reshape(-1)
-    starts = np.arange(len(u) + 1) * 16
-    a = scipy.sparse.csr_matrix((data, index, starts), shape=(len(u), nu * nv))
-    matrix = (a.T @ a).tocsc() if plate is None else (a.T @ a + plate).tocsc()
-    held = border(nu, nv, corners_only=False).ravel()
-    flat = net.reshape(-1, 3).copy()
-    right = a.T @ points - matrix[:, held] @ flat[held]
-    inner = matrix[~held][:, ~held].tocsc()
-    solve = cholesky(inner) if cholesky else splu(inner).solve
-    flat[~held] = solve(right[~held])
-    return flat.reshape(net.shape)
-
-
-def plate_of(knots, net):
-    (u0, u1, u2), (v0, v1, v2) = (squares(k, n) for k, n in zip(knots, net.shape[:2], strict=True))
+def plate_of(knots, shape):
+    """The matrix of the thin plate, equation (10)."""
+    (u0, u1, u2), (v0, v1, v2) = (squares(k, n) for k, n in zip(knots, shape[:2], strict=True))
     parts = ((u2, v0, 1), (u1, v1, 2), (u0, v2, 1))
-    sparse = [
-        f * scipy.sparse.kron(scipy.sparse.csr_matrix(a), scipy.sparse.csr_matrix(b)) for a, b, f in parts
-    ]
+    sparse = [scipy.sparse.kron(*(scipy.sparse.csr_matrix(x) for x in (f * a, b))) for a, b, f in parts]
     total = (sparse[0] + sparse[1] + sparse[2]).tocsr()
     total.data[np.abs(total.data) < 1e-14 * np.abs(total.data).max()] = 0.0
     total.eliminate_zeros()
     return total
 
 
-def rms(knots, net, u, v, points):
-    surface = scipy.interpolate.NdBSpline(knots, np.asarray(net), 3)
-    return np.sqrt(np.mean(np.sum((surface(np.stack([u, v], axis=-1)) - points) ** 2, axis=1)))
+def timed(work):
+    """Seconds and the result."""
+    begun = time.perf_counter()
+    result = work()
+    return time.perf_counter() - begun, result
+
+
+def report(title, works, turns, diagonal):
+    """Times in turns, their ratio, and how far the two are apart."""
+    begun = [timed(work) for work in works.values()]
+    times = np.array([[timed(work)[0] for work in works.values()] for _ in range(turns)])
+    apart = np.abs(begun[0][1] - begun[1][1]).max() / diagonal
+    medians = np.median(times, axis=0)
+    print(title)
+    for k, name in enumerate(works):
+        low, high = 1e3 * times[:, k].min(), 1e3 * times[:, k].max()
+        spent = f"{1e3 * medians[k]:>9.1f} ms  [{low:.1f}, {high:.1f}]"
+        print(f"  {name:<20}{spent}   first {1e3 * begun[k][0]:.0f} ms")
+    print(f"  {medians[0] / medians[1]:.3f} times its time, control points apart {apart:.1e}", flush=True)
 
 
 def main():
-    parser = argparse.ArgumentParser(description="one least-squares solve with given parameters")
+    """Print all cases."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--turns", type=int, default=7)
     parser.add_argument("--case", type=int, nargs="*", default=range(len(CASES)))
     options = parser.parse_args()
     other = "SciPy + CHOLMOD" if cholesky else "SciPy + splu"
-    print(f"jax {jax.__version__}, {jax.default_backend()}, float64, order (4, 4)")
+    print(f"jax {jax.__version__}, {jax.default_backend()}, float64, order (4, 4), all control points free")
+    if not cholesky:
+        print("scikit-sparse is not installed: SciPy's splu stands in for CHOLMOD")
     for count, nu, nv in (CASES[i] for i in options.case):
         u, v, points = cloud(count)
         knots = tuple(helpers.clamped_uniform(n, 4) for n in (nu, nv))
-        x, y = np.meshgrid(*(np.convolve(k[1:-1], np.ones(3) / 3, "valid") for k in knots), indexing="ij")
-        net = np.stack([x, y, np.zeros_like(x)], axis=-1)
+        net = flat_net(knots)
         for smoothing in (0.0, SMOOTHING):
-            plate = smoothing * plate_of(knots, net) if smoothing else None
-            inputs = jax.device_put((make_pieces(net, *knots), net, u, v, points, np.asarray(smoothing)))
-            memory = [held(f, inputs) for f in (through_optimistix, bare)]
+            plate = smoothing * plate_of(knots, net.shape) if smoothing else None
             works = {
-                "jaxfit, through optimistix": lambda i=inputs: jax.block_until_ready(through_optimistix(*i)),
-                "jaxfit, bare": lambda i=inputs: jax.block_until_ready(bare(*i)),
-                other: lambda a=(knots, net, u, v, points, plate): scipy_solve(*a),
+                "jaxfit": lambda a=(knots, net, u, v, points, smoothing): ours(*a),
+                other: lambda a=(knots, net.shape, u, v, points, plate): scipys(*a),
             }
-            memory.append(allocated(works[other]))
             title = f"{count} points, {nu}x{nv}, lambda {smoothing:g}"
-            report(title, works, options.turns, inputs, knots, memory)
-
-
-def held(function, inputs):
-    """MiB of inputs, results and temporaries of a compiled function."""
-    analysis = function.lower(*inputs).compile().memory_analysis()
-    parts = (analysis.argument_size_in_bytes, analysis.output_size_in_bytes, analysis.temp_size_in_bytes)
-    return sum(parts) / 2**20
-
-
-def allocated(work):
-    """MiB that NumPy and SciPy take at most (CHOLMOD's factors are not seen)."""
-    tracemalloc.start()
-    work()
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return most / 2**20
-
-
-def report(title, works, turns, inputs, knots, memory):
-    """Times in turns, distances from the points, and memory."""
-    print(title)
-    results = {name: work() for name, work in works.items()}
-    times = {name: [] for name in works}
-    for _ in range(turns):
-        for name, work in works.items():
-            begun = time.perf_counter()
-            work()
-            times[name].append(time.perf_counter() - begun)
-    u, v, points = (np.asarray(x) for x in inputs[2:5])
-    last = np.median(list(times.values())[-1])
-    for (name, spent), most in zip(times.items(), memory, strict=True):
-        low, middle, high = (1e3 * x for x in (min(spent), np.median(spent), max(spent)))
-        error = rms(knots, results[name], u, v, points)
-        ratio = 1e3 * last / middle
-        print(
-            f"  {name:<28}{middle:>9.1f} ms  [{low:.1f}, {high:.1f}]  {ratio:>6.2f} times as fast   "
-            f"rms {error:.9e}   {most:>7.0f} MiB",
-            flush=True,
-        )
+            report(title, works, options.turns, helpers.diagonal(points))
 
 
 if __name__ == "__main__":

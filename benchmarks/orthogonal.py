@@ -33,7 +33,6 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import jaxfit as jf
-from jaxfit._normal_equations import curvature_energy
 
 TARGETS = {"mq": 6e-4, "cm": 2e-4}
 LAMBDAS = {"mq": 5e-6, "igea_face": 1e-6, "mountain": 5e-6, "mannequin_head": 5e-6}
@@ -159,7 +158,7 @@ def compared(options, name, runs):
     for method, steps in runs:
         fit = jf.approximate(points, base, method, tol_average=1e-12, max_steps=steps, start=start)
         errors.append(float(fit.average_error))
-        energy = float(curvature_energy(fit.surface))
+        energy = float(jf.curvature_energy(fit.surface))
         bending = float(fit.stats.get("bending_energy", np.nan)) / float(fit.stats["diagonal"]) ** 2
         plate = getattr(method, "smoothing", "")
         cells = (name, type(method).__name__, plate, steps, *columns(fit), f"{energy:.4g}")

@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
-    SLOTS_PER_BLOCK,
     Rows,
     make_rows,
     make_single_rows,
@@ -38,6 +37,9 @@ ONE_OF = 3
 # A block on a CPU is too little to be shared among cores, which costs more than it gains; whole clouds are
 # shared instead.
 ROWS_PER_BLOCK = 2048
+# Smaller blocks than sums over all points have: the last few stragglers fill none, and cost as much as a
+# whole one.
+SLOTS_PER_BLOCK = 1024
 # Below this many points, or points per cell, rows of several points are too empty to pay.
 SHARED_FROM_POINTS = 4096
 SHARED_FROM_FILL = 2
