@@ -16,8 +16,8 @@ from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit as jf
 from jaxfit import _cli
+from jaxfit._approximation._smoothing_term import check_smoothing
 from jaxfit._checks import check_number
-from jaxfit._fit._problem import check_smoothing
 from jaxfit.io import InputError, read_points, read_surface, write_surface
 
 GRID = wavy_grid(8, 7)

@@ -59,7 +59,9 @@ def _counted(points: Any, weight: Any) -> Any:
         return points
     if is_concrete(points, weight):
         counted = np.asarray(weight) > 0
-        return points if counted.all() else np.asarray(points)[counted]
+        some = np.asarray(points)[counted]
+        # Points that all coincide give no unit.
+        return points if counted.all() or not np.ptp(some, axis=0).any() else some
     # Traced weights: points of weight 0 are replaced by one that counts.
     points, weight = jnp.asarray(points), jnp.asarray(weight)
     first = points[jnp.argmax(weight > 0)]

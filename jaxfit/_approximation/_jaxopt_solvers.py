@@ -1,6 +1,7 @@
 """Adapters to the least-squares drivers of `jaxopt`, which is imported when first used."""
 
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +70,7 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
         return _minimised("LevenbergMarquardt", problem, self.tolerance, self.max_steps)
 
 
-def _minimised(name: str, problem: LeastSquaresProblem, tolerance: float, steps: int) -> tuple[Array, Array]:
+def _minimised(name: str, problem: LeastSquaresProblem, tolerance: Any, steps: int) -> tuple[Array, Array]:
     """Runs jaxopt's driver of this name on the residual as one vector of the control points as one vector."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says at import that it is not maintained
@@ -81,7 +82,9 @@ def _minimised(name: str, problem: LeastSquaresProblem, tolerance: float, steps:
 
     eps = float(jnp.finfo(problem.net.dtype).eps)
     driver = getattr(jaxopt, name)
-    options = dict(maxiter=steps, tol=max(tolerance, 10 * eps), implicit_diff=False, jit=True, unroll=False)
+    options = dict(
+        maxiter=steps, tol=jnp.maximum(tolerance, 10 * eps), implicit_diff=False, jit=True, unroll=False
+    )
     solver = driver(residual, **options)
     net = solver.run(problem.net.reshape(-1)).params.reshape(problem.net.shape)
     net = jnp.where(problem.normal.free[:, :, None], net, problem.net)

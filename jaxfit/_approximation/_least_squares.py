@@ -103,7 +103,7 @@ class LevenbergMarquardt(AbstractLeastSquares):
 
         eps = float(jnp.finfo(problem.net.dtype).eps)
         linear = lx.Normal(lx.CG(rtol=10 * eps, atol=10 * eps, max_steps=problem.net.size))
-        tolerance = max(self.tolerance, 10 * eps)
+        tolerance: Any = jnp.maximum(self.tolerance, 10 * eps)
         solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
         net = _solution(solver, problem, self.max_steps).value
         return _free_part(problem, net), jnp.zeros((), net.dtype)

@@ -236,6 +236,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
             correction_rhs,
         )
         following, predicted = materialise(always, solve, equations, net, held, damping.damping)
+        lost = jnp.isnan(iterate.state.smoothing)  # a traced lambda that is none
+        following = jnp.where(lost, jnp.nan, following)
         damped = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
         state = OrthogonalState(iterate.state.smoothing, damped, iterate.state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history

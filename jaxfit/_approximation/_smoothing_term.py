@@ -15,7 +15,9 @@ def check_smoothing(smoothing: Any) -> None:
     if not is_concrete(smoothing):
         return
     try:
-        value = np.asarray(np.nan if isinstance(smoothing, bool) else smoothing, np.float64)
+        value = np.asarray(
+            np.nan if isinstance(smoothing, bool | np.bool_ | str | bytes) else smoothing, np.float64
+        )
     except (TypeError, ValueError):
         value = np.asarray(np.nan)
     if value.ndim or not 0 <= value < np.inf:

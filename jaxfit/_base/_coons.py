@@ -27,8 +27,8 @@ class Greville(AbstractAbscissae):
 
     Examples
     --------
-    >>> print(np.round(jf.Greville()(jf.clamped_uniform_knots(5, 4), 4), 3))
-    [0.    0.167 0.5   0.833 1.   ]
+    >>> [round(float(x), 3) for x in jf.Greville()(jf.clamped_uniform_knots(5, 4), 4)]
+    [0.0, 0.167, 0.5, 0.833, 1.0]
     """
 
     def __call__(self, knots: Float[Array, " knots"], order: int) -> Float[Array, " n"]:
@@ -44,8 +44,8 @@ class Uniform(AbstractAbscissae):
 
     Examples
     --------
-    >>> print(np.round(jf.Uniform()(jf.clamped_uniform_knots(5, 4), 4), 3))
-    [0.   0.25 0.5  0.75 1.  ]
+    >>> [round(float(x), 3) for x in jf.Uniform()(jf.clamped_uniform_knots(5, 4), 4)]
+    [0.0, 0.25, 0.5, 0.75, 1.0]
     """
 
     def __call__(self, knots: Float[Array, " knots"], order: int) -> Float[Array, " n"]:

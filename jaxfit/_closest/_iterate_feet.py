@@ -219,7 +219,7 @@ class _Pass(eqx.Module):
             found &= ~mode.fixed | (before == FOUND)
             state = jnp.where(done, jnp.where(found, float(SUMMED_FOUND), float(SUMMED_GIVEN_UP)), feet.state)
             counts = done & jnp.isfinite(feet.f)
-            local = jnp.where(counts, lax.clamp(-1.0, bounds.local(feet.best), 1.0), 0.0)
+            local = jnp.where(counts, jnp.clip(bounds.local(feet.best), -1.0, 1.0), 0.0)
             assert feet.e is not None
             e, weight = jnp.where(counts, feet.e, 0.0), counts.astype(feet.f.dtype)
             return state, local, e, weight if given is None else weight * given

@@ -148,7 +148,7 @@ def _downhill(
 
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.
     """
-    step = bounds.clip_step(x, lax.clamp(-LONGEST_STEP, step, LONGEST_STEP))
+    step = bounds.clip_step(x, jnp.clip(step, -LONGEST_STEP, LONGEST_STEP))
     uphill = total(forms.gradient * step) <= 0
     slope = 0.5 * forms.gradient / jnp.maximum(forms.metric, jnp.finfo(x.dtype).tiny)
     slope = bounds.clip_step(x, jnp.where(pinned, 0.0, slope))

@@ -113,12 +113,9 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     Examples
     --------
     >>> import jaxfit as jf
-    >>> import numpy as np
-    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
-    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
     >>> method = jf.GeometricInterpolation(acceleration=jf.Chebyshev())
-    >>> bool(jf.interpolate(grid, method).converged)
-    True
+    >>> method.repositioning, method.freeze_after, method.parametrisation
+    (OptimalRepositioning(), 2, ChordLength())
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

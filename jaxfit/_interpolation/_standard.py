@@ -75,12 +75,8 @@ class StandardInterpolation(AbstractDirectInterpolation):
     Examples
     --------
     >>> import jaxfit as jf
-    >>> import numpy as np
-    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
-    >>> grid = np.stack([x, y, 0.1 * np.sin(3 * x) * y], axis=-1)
-    >>> fit = jf.interpolate(grid, jf.StandardInterpolation())
-    >>> float(fit.maximum_error) < 1e-5
-    True
+    >>> jf.StandardInterpolation().iterative, jf.StandardInterpolation(per_point=True).iterative
+    (False, True)
     """
 
     parametrisation: AbstractParametrisation = ChordLength()

@@ -126,8 +126,8 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
 
     Examples
     --------
-    >>> print(np.round(jf.greville_abscissae(jf.clamped_uniform_knots(5, 4), 4), 3))
-    [0.    0.167 0.5   0.833 1.   ]
+    >>> [round(float(x), 3) for x in jf.greville_abscissae(jf.clamped_uniform_knots(5, 4), 4)]
+    [0.0, 0.167, 0.5, 0.833, 1.0]
     """
     values = as_floating("knots", knots, 1)
     if not 2 <= order < values.shape[0]:
