@@ -243,7 +243,7 @@ def test_residuals_at_feet_are_orthogonal_to_the_tolerance(method, tolerance):
     for order in ((1, 0), (0, 1)):
         tangent = np.asarray(surface.derivative(feet.u, feet.v, *order))
         part = np.sum(away * tangent, axis=1) / np.linalg.norm(tangent, axis=1)
-        # Now and then what was foreseen is a little short.
+        # A predicted residual may be slightly too small.
         assert np.abs(part[inner]).max() <= 3 * tolerance * size
 
 

@@ -32,7 +32,7 @@ def wild():
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=named)
-def test_the_pull_is_the_derivative_of_the_cost(loss):
+def test_the_derivative_is_that_of_the_cost(loss):
     square = jnp.asarray([0.0, 0.1, 0.5, 0.9, 1.5, 4.0, 100.0])
     slope = jax.vmap(jax.grad(loss.cost))(square)
     assert np.abs(np.asarray(slope - loss.derivative(square))).max() < 1e-12

@@ -1,4 +1,4 @@
-"""The verb for scattered points: a surface near all of them, from a base surface."""
+"""`approximate`: fits a base surface to scattered points."""
 
 from typing import Any
 
@@ -40,26 +40,26 @@ def approximate(
     throw: bool = False,
     errors: AbstractErrors | None = None,
 ) -> Fit:
-    """A surface on the net and the knots of `base` that comes close to a cloud of points.
+    """Fit a surface with the net and the knots of `base` to a cloud of points.
 
     Parameters
     ----------
     points : array (points, d)
         In any order, any unit.
     base : BSplineSurface
-        A first approximation, for instance from `base_surface`. Its knots are kept, and others come between
-        them only where the method has an `insertion`.
-    method : GeometricApproximation(), OrthogonalDistance() or StandardApproximation(), optional
-        Default: GeometricApproximation(), which asks for no smoothing. OrthogonalDistance comes closer in
-        fewer iterations. The fit's `stats["method"]` says which it was.
+        A first approximation, for instance from `base_surface`. Its knots are kept; new ones are inserted
+        only where the method has an `insertion`.
+    method : GeometricApproximation(), OrthogonalDistance(), StandardApproximation() or your own, optional
+        Any `AbstractIterativeMethod` (default GeometricApproximation(), which needs no smoothing).
+        OrthogonalDistance comes closer in fewer iterations. The fit's `stats["method"]` is its name.
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
-        diagonal of the data's bounding box; None asks for nothing (two Nones, and the base is
-        returned). Default: 6e-4 (the paper's 0.06 %) on average.
+        diagonal of the data's bounding box. None sets no limit; with two Nones the base is returned. Default:
+        6e-4 (the paper's 0.06 %) on average, no limit on the maximum.
     max_steps : int
-        Most iterations.
+        The largest number of iterations (default 200).
     weights : array (points,), optional
-        Non-negative; how much each point pulls. Errors are not weighted.
+        The non-negative weight of each point (default 1). Errors are not weighted.
     start : pair of arrays (points,), optional
         Feet (u, v) on the base surface to start from; default the closest points, searched globally.
     progress : callable, optional
@@ -67,14 +67,13 @@ def approximate(
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
     errors : GlobalFeet(), LocalFeet() or AtParameters(), optional
-        How certain the errors of the fit are to be (default GlobalFeet(), for every method): at true closest
-        points, at local ones, or at the parameters that the method ended with.
+        Where the errors of the fit are measured (default GlobalFeet(), for every method): at true closest
+        points, at local foot points, or at the parameters that the method ended with.
 
     Returns
     -------
     Fit
-        Errors are distances to true closest points: outside transformations the feet are looked for
-        globally once more at the end. The iteration itself, and its history, follow local feet.
+        Its errors are measured as `errors` says. The iteration itself and its history use local feet.
 
     Raises
     ------
@@ -84,9 +83,9 @@ def approximate(
 
     Notes
     -----
-    Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; to
-    differentiate through a fit raises a TypeError. Outside transformations clouds are padded to one of four
-    sizes per octave, so that a second cloud of similar size compiles nothing.
+    Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; on a CPU a batch is fitted
+    one after the other. Differentiating through a fit raises a TypeError. Outside transformations clouds are
+    padded to one of four sizes per octave, so that a second cloud of similar size compiles nothing.
 
     Examples
     --------
@@ -175,8 +174,9 @@ def _padded(x: Any, size: int, dtype: Any) -> Any:
 
 
 def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
-    """An order of points, `count` true ones first, in which those of one cell come together: neighbours in
-    memory are then neighbours on the surface, and laying points out in rows is quicker.
+    """The points sorted by cell, the `count` true ones first.
+
+    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster.
     """
     axis_u, axis_v = surface.axes
     xp: Any = np if is_concrete(surface.axes, u, v) else jnp
@@ -189,9 +189,9 @@ def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
 
 
 def _fitted(loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit) -> BSplineSurface:
-    """The fitted surface in the user's unit; control points that have not moved keep every bit.
+    """The fitted surface in the user's unit. Control points that have not moved keep every bit.
 
-    Inside transformations a net with room for more keeps its surplus control points.
+    Inside transformations a net with room for knots keeps its surplus control points.
     """
     end = loop.current.surface
     concrete = is_concrete(end, base)
@@ -208,7 +208,7 @@ def _fitted(loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: 
 
 
 def _in_given_order(loop: LoopState, order: Any, count: int, unit: Unit, concrete: bool) -> Feet:
-    """Where the fit ended, in the order of the points and in the user's unit."""
+    """The last feet, in the order of the points and in the user's unit."""
     here = loop.current.projection
     xp: Any = np if concrete else jnp
     back = xp.argsort(order)[:count]
@@ -224,7 +224,7 @@ def _at_feet(
     at_feet: bool,
     concrete: bool,
 ) -> Feet:
-    """Where the errors are measured."""
+    """The feet at which the errors are measured."""
     if not concrete and at_feet:
         return known
     return (GlobalFeet() if errors is None else errors).feet(surface, cloud, known, at_feet)
@@ -239,7 +239,7 @@ def _fit(
     stats: dict[str, Any],
     fairing: Any,
 ) -> Fit:
-    """The result, of which the points that count make averages and maxima."""
+    """The result. Averages and maxima are over the points of positive weight."""
     concrete = is_concrete(loop, parts, unit)
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)

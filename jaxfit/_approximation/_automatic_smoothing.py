@@ -1,9 +1,9 @@
-r"""Choosing lambda from the data, with the parameters of the points held.
+r"""`GeneralizedCrossValidation` and `Discrepancy`: lambda chosen from the data.
 
-Then the fit is linear in the data, $A P = H(\lambda) Q$, and each lambda takes one factorisation of
-$S + \lambda A_{fair}$, S being the normal matrix of the data. It gives the sum of squares that remains,
-$|Q - A P|^2$, in space counted along the normals only, since what remains along the surface goes when the
-parameters are corrected; and the number of parameters in effect,
+With the parameters of the points held, the fit is linear in the data, $A P = H(\lambda) Q$. Each lambda takes
+one factorisation of $S + \lambda A_{fair}$, S being the normal matrix of the data. It gives two numbers: the
+residual sum of squares $|Q - A P|^2$, in space along the normals only, since parameter correction removes the
+tangential part; and the effective number of parameters,
 $\operatorname{tr} H = \operatorname{tr} S (S + \lambda A_{fair})^{-1}$, estimated from random signs.
 """
 
@@ -31,16 +31,16 @@ DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same tra
 
 
 class Candidates(eqx.Module):
-    """Several lambdas in increasing order, and what remains of the data for each."""
+    """Several lambdas in increasing order, each with its residual and its effective number of parameters."""
 
     smoothing: Float[Array, " lambdas"]
-    remaining: Float[Array, " lambdas"]  # sum of squares, weighted
+    remaining: Float[Array, " lambdas"]  # weighted sum of squared residuals
     effective: Float[Array, " lambdas"]  # number of parameters, for each coordinate
     points: Float[Array, ""]
 
 
 class AbstractSmoothing(eqx.Module):
-    """A rule that chooses lambda, out of `candidates`, in as many `rounds`."""
+    """A rule that selects lambda."""
 
     @abstractmethod
     def best(self, candidates: Candidates) -> Float[Array, ""]:
@@ -50,19 +50,20 @@ class AbstractSmoothing(eqx.Module):
 class GeneralizedCrossValidation(AbstractSmoothing):
     r"""The lambda that would predict left-out points best.
 
-    That is the least $|Q - A P|^2 / (N - \operatorname{tr} H)^2$ over N points.
+    It minimises $|Q - A P|^2 / (N - \operatorname{tr} H)^2$ over N points.
 
-    Needs nothing to be known of the noise, but that it is independent from point to point, and parameters
-    that do not follow it. Those on a base made with the points (`Meshless`) do where the noise is as large as
-    the distances between points; lambda is then chosen too small, by orders of magnitude, and
-    `Discrepancy` is the better choice. Golub, Heath and Wahba, Technometrics 21 (1979).
+    The noise need not be known. It must be independent from point to point, and the parameters must not
+    follow it. They do follow it on a base made with the points (`Meshless`) where the noise is as large as
+    the distances between points. lambda is then too small by orders of magnitude, and `Discrepancy` is the
+    better choice. Golub, Heath and Wahba, Technometrics 21 (1979).
 
     Parameters
     ----------
     candidates : int
-        Lambdas tried, evenly in their logarithm over twelve decades; a parabola goes through the best three.
+        The number of lambdas (default 17), spaced evenly in their logarithm over twelve decades. A parabola
+        through the best three gives the minimum.
     rounds : int
-        How often: at the first parameters, and again at those corrected on the surface found.
+        The number of selections (default 2): at the first parameters, then at corrected ones.
 
     Raises
     ------
@@ -84,15 +85,15 @@ class GeneralizedCrossValidation(AbstractSmoothing):
         _check_counts(self)
 
     def best(self, candidates: Candidates) -> Float[Array, ""]:
-        """The minimum, interpolated."""
+        """The interpolated minimum."""
         return _cross_validated(candidates)
 
 
 class Discrepancy(AbstractSmoothing):
-    """The largest lambda that leaves no more than the noise: the discrepancy principle of Morozov.
+    """The largest lambda whose residual does not exceed the noise: Morozov's discrepancy principle.
 
-    Where even the least leaves more, the net and not lambda sets what remains, and the principle is silent:
-    then as `GeneralizedCrossValidation` chooses.
+    Where even the smallest lambda leaves a larger residual, the net and not lambda limits the fit. The rule
+    of `GeneralizedCrossValidation` then applies.
 
     Parameters
     ----------
@@ -129,7 +130,7 @@ class Discrepancy(AbstractSmoothing):
         _check_counts(self)
 
     def best(self, candidates: Candidates) -> Float[Array, ""]:
-        """Where the remaining sum of squares passes that of the noise."""
+        """The lambda at which the residual sum of squares equals that of the noise."""
         goal = jnp.log(candidates.points) + 2.0 * np.log(max(self.noise, 1e-30))
         remaining = lax.cummax(jnp.log(candidates.remaining))
         passed = jnp.exp(jnp.interp(goal, remaining, jnp.log(candidates.smoothing)))
@@ -159,7 +160,7 @@ PROBES = 16
 def evaluate_candidates(
     system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int
 ) -> Candidates:
-    """All candidates, on the problem of improving `net`; one factorisation for each."""
+    """All candidates for the correction of `net`; one factorisation for each."""
     data, plate = system.data_stencil(), system.plate.stencil()
     free = free_points(data.plus(plate, 1.0), held)
     mask = jnp.asarray(free)[:, :, None]
@@ -202,7 +203,7 @@ def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[A
 def select_smoothing(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:
-    """The lambda for a fit that starts from a surface and its feet."""
+    """The lambda for a fit that starts from `surface` and its feet."""
     without = eqx.tree_at(lambda m: m.smoothing, method, 0.0)
     return _select(rule, without, problem, surface, projection)
 
@@ -211,11 +212,11 @@ def select_smoothing(
 def _select(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:
-    """Each round solves with the lambda it has found, and corrects the parameters."""
+    """Each round selects lambda, solves with it, and corrects the parameters."""
     held, diagonal = method.held(surface), problem.diagonal
 
-    def one(_: Any, carry: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
-        net, here, _ = carry
+    def one_round(_: Any, last: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
+        net, here, _ = last
         system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
         candidates = evaluate_candidates(system, held, net, rule.candidates)
         scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
@@ -227,4 +228,4 @@ def _select(
     rounds = rule.rounds if method.parameter_correction else 1
     net = surface.control_points
     start = eqx.tree_at(lambda p: p.exact, projection, jnp.asarray(True))
-    return lax.fori_loop(0, rounds, one, (net, start, jnp.zeros((), net.dtype)))[2]
+    return lax.fori_loop(0, rounds, one_round, (net, start, jnp.zeros((), net.dtype)))[2]

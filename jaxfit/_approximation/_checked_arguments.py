@@ -1,4 +1,4 @@
-"""What is asked of a fit of scattered points, checked before anything is computed."""
+"""Checks of the arguments of `approximate` and `fit_points`."""
 
 from typing import Any
 
@@ -29,9 +29,9 @@ def checked_request(
     throw: Any = False,
     errors: Any = None,
 ) -> tuple[Unit, Any, Any]:
-    """Unit, weights and first feet of a fit; raises for what `approximate` could not do with these points.
+    """The unit, the weights and the first feet of a fit; raises if an argument is not valid.
 
-    The `domain` is that of the base surface, once there is one.
+    `domain` is that of the base surface, where there is one.
     """
     check_switch("throw", throw)
     if method is not None:
@@ -54,7 +54,7 @@ def checked_request(
 
 
 def _counted(points: Any, weight: Any) -> Any:
-    """The points that have influence: the others have none on the unit of the fit either."""
+    """The points of positive weight: only they determine the unit of the fit."""
     if weight is None:
         return points
     if is_concrete(points, weight):
@@ -72,17 +72,17 @@ def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
     """One weight for each point, or None."""
     if weights is None:
         return None
-    pulls = as_floating("weights", weights, 1)
-    if pulls.shape[0] != count:
+    weight = as_floating("weights", weights, 1)
+    if weight.shape[0] != count:
         raise ValueError(
             f"weights must hold one number for each of the {count} points, but has shape "
-            f"{pulls.shape}; give both the same length."
+            f"{weight.shape}; give both the same length."
         )
-    if is_concrete(pulls) and (np.asarray(pulls).min() < 0 or not np.asarray(pulls).any()):
+    if is_concrete(weight) and (np.asarray(weight).min() < 0 or not np.asarray(weight).any()):
         raise ValueError(
             "weights must not be negative and not all zero; give each point a weight of 0 or more."
         )
-    return pulls
+    return weight
 
 
 def _checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""How certain the errors of a fit are to be: at which parameters they are measured."""
+"""`GlobalFeet`, `LocalFeet` and `AtParameters`: where the errors of a finished fit are measured."""
 
 from abc import abstractmethod
 from typing import Any
@@ -28,9 +28,9 @@ class AbstractErrors(eqx.Module):
 
 
 class AtParameters(AbstractErrors):
-    """Errors at the parameters that the fit ended with: nothing is evaluated any more.
+    """Errors at the parameters that the fit ended with: no further evaluation, so the cheapest.
 
-    Those of a method that holds the parameters it is given are upper bounds of the distances. The cheapest.
+    Where the method holds given parameters, these errors are upper bounds of the distances.
 
     Examples
     --------
@@ -40,12 +40,12 @@ class AtParameters(AbstractErrors):
     """
 
     def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
-        """As they are."""
+        """The known ones."""
         return known
 
 
 class LocalFeet(AbstractErrors):
-    """Errors at local foot points: those that the iteration comes to from the parameters it ended with.
+    """Errors at local foot points, found from the parameters that the fit ended with.
 
     Another part of the surface may be nearer.
 
@@ -57,7 +57,7 @@ class LocalFeet(AbstractErrors):
     """
 
     def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
-        """The known ones, or those that lie downhill from them."""
+        """The known ones if they are feet, or else the local feet found from them."""
         if at_feet:
             return known
         found = closest_point(surface, points, start=(known[0], known[1]))
@@ -67,8 +67,8 @@ class LocalFeet(AbstractErrors):
 class GlobalFeet(AbstractErrors):
     """Errors at true closest points: the whole surface is searched. The default of every method.
 
-    Most feet are proven to be the nearest by a bound; the search goes on for the others. Inside
-    transformations local feet stand in for them.
+    A bound proves that most local feet are the nearest; only the others are searched for. Inside
+    transformations a fit that ends on feet keeps its local ones.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class GlobalFeet(AbstractErrors):
     """
 
     def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
-        """The nearest of all."""
+        """The nearest feet on the whole surface."""
         if not is_concrete(surface, points, known):
             found = closest_point(surface, points)
             return found.u, found.v, found.distance, found.converged

@@ -1,4 +1,4 @@
-"""Where converging feet start in the next iteration: ahead by most of their last step."""
+"""Extrapolation of converging feet: in the next iteration they start ahead by most of their last step."""
 
 from typing import Any
 
@@ -24,12 +24,12 @@ class Extrapolation(eqx.Module):
 
     @staticmethod
     def none(u: Any) -> "Extrapolation":
-        """Before the first step of feet with parameters `u`, one of two."""
+        """Before the first step; `u` gives shape and type."""
         xp: Any = np if is_concrete(u) else jnp
         return Extrapolation(xp.zeros((2, *u.shape), u.dtype), xp.asarray(np.inf, u.dtype))
 
     def predict(self, axes: tuple[Axis, Axis], u: Array, v: Array) -> tuple[Array, Array]:
-        """Where feet at (u, v) start: within the domain, and not so far that it may be near another foot."""
+        """The start of feet at (u, v): within the domain, and at most FARTHEST away."""
         starts = []
         for axis, x, step in zip(axes, (u, v), self.last_step, strict=True):
             low, high = axis.breaks[0], axis.breaks[-1]
@@ -38,8 +38,9 @@ class Extrapolation(eqx.Module):
         return starts[0], starts[1]
 
     def after(self, step: Float[Array, "2 points"]) -> "Extrapolation":
-        """What a step leaves. One that is much longer, as after fairing or new knots, does not lead on: what
-        follows is not like it.
+        """The state after `step`.
+
+        A step that is much longer than the last one, as after fairing or new knots, is not extrapolated.
         """
         rms = jnp.sqrt(jnp.vdot(step, step) / step.size)
         return Extrapolation(jnp.where(rms > MAX_GROWTH * self.rms_step, 0.0, step), rms)

@@ -1,4 +1,4 @@
-"""Fairing of a control net between iterations: section 4.3 of the paper."""
+"""`Fairing`: smoothing of a control net between iterations (section 4.3 of the paper)."""
 
 import math
 
@@ -12,15 +12,15 @@ class Fairing(eqx.Module):
     r"""Every so many iterations each interior control point becomes a mean of its 3 x 3 neighbours (Box III).
 
     The weights are 1 for itself, $e^{-\gamma}$ for the four nearest and $e^{-2\gamma}$ for the four diagonal
-    ones, over their sum; all points move at once, after the iteration's own move. The error rises by it and
-    falls again within a few iterations: fairing is there for the shape, and does not lower errors.
+    ones, over their sum; all points move at once, after the iteration's own move. Fairing improves the shape
+    and does not lower errors: they rise and fall again within a few iterations.
 
     Parameters
     ----------
     every : int
         Iterations from one fairing to the next (default 20).
     gamma : float
-        At least 0 (default 2): the greater, the weaker.
+        At least 0 (default 2); fairing is weaker for greater values.
 
     Raises
     ------
@@ -47,7 +47,7 @@ class Fairing(eqx.Module):
             raise ValueError(f"gamma must be finite and at least 0, but is {self.gamma!r}; 2 is usual.")
 
     def __call__(self, net: Float[Array, "nu nv d"], held: Bool[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
-        """The faired net; its border, and what is `held`, stays."""
+        """The faired net; its border and `held` control points do not move."""
         near = jnp.exp(-jnp.asarray(self.gamma, net.dtype))
         total = 1.0 + 4.0 * near + 4.0 * near**2
         # The mean is a product of one along each direction.

@@ -1,4 +1,4 @@
-"""The verb for scattered points and the curves around them: a base surface, then a fit."""
+"""`fit_points`: a base surface from the boundary of a cloud, then a fit."""
 
 import inspect
 from typing import Any
@@ -24,7 +24,7 @@ def fit_points(
     base: Coons | AbstractBaseMethod | None = None,
     **options: Any,
 ) -> Fit:
-    """The whole way from a cloud and its four boundary polylines to a fitted surface.
+    """Fit a surface to a cloud of points with four boundary polylines: `base_surface`, then `approximate`.
 
     Parameters
     ----------
@@ -35,12 +35,12 @@ def fit_points(
         Control points along u and v. Default: about one for every eight points, shared between the
         directions by the lengths of the sides, at least twice the order and at most 64 each.
     order : (K, L)
-        Degree + 1 along u and v.
+        Degree + 1 along u and v (default (4, 4)).
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer.
     method, options
-        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw.
+        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors.
 
     Returns
     -------

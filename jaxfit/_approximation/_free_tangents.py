@@ -15,11 +15,11 @@ PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count a
 
 
 class FreeTangents(NamedTuple):
-    """An orthogonal basis: R_u, and the part of R_v at right angles to it, each 0 where it is not free.
+    """An orthogonal basis: R_u, and the part of R_v orthogonal to it, each 0 where it is not free.
 
-    At a foot on the border only those directions are free in which the residual does not hold it there; of
-    parallel tangents one counts. `share` is how much of R_u is in R_v; the last two are 1 over squared
-    lengths, or 0.
+    At a foot on the border a direction is free unless the residual points out of the domain. Of parallel
+    tangents one counts. `share` is the component of R_v along R_u. `per_first` and `per_second` are 1 over
+    the squared lengths, or 0.
     """
 
     first: Float[Array, "d ..."]

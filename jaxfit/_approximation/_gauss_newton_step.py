@@ -1,4 +1,4 @@
-"""The step of orthogonal distance: a damped Gauss-Newton step and its correction of second order."""
+"""One step of `OrthogonalDistance`: a damped Gauss-Newton step and its second-order correction."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,7 +26,7 @@ def gauss_newton_step(
     held: Bool[Array, "nu nv"],
     damping: Float[Array, ""],
 ) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-    """The net after the step, and by how much the objective should fall.
+    """The net after the step, and the predicted reduction of the objective.
 
     `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
     damping 1 there is none.

@@ -1,4 +1,4 @@
-"""The adapter to `jaxopt`, imported when first used: its drivers for the least-squares problem of a fit."""
+"""Adapters to the least-squares drivers of `jaxopt`, which is imported when first used."""
 
 import warnings
 from typing import Any
@@ -17,9 +17,10 @@ class JaxoptGaussNewton(AbstractLeastSquares):
     Parameters
     ----------
     tolerance : float
-        On the last step, the norm over all control points, in units of the data's extent.
+        The largest norm of the last step, over all control points, in units of the data's extent (default
+        1e-10).
     max_steps : int
-        Most steps; each gains the accuracy of one CG solve, a factor of about 1e5.
+        The largest number of steps (default 20); each gains the accuracy of one CG solve, a factor of 1e5.
 
     Raises
     ------
@@ -36,7 +37,7 @@ class JaxoptGaussNewton(AbstractLeastSquares):
     max_steps: int = 20
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-        """As many steps as it takes."""
+        """Run jaxopt's driver."""
         return _minimised("GaussNewton", problem, self.tolerance, self.max_steps)
 
 
@@ -46,9 +47,9 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
     Parameters
     ----------
     tolerance : float
-        On the norm of the gradient, in units of the data's extent.
+        The largest norm of the gradient, in units of the data's extent (default 1e-11).
     max_steps : int
-        Most steps of damping.
+        The largest number of steps (default 60).
 
     Raises
     ------
@@ -65,7 +66,7 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
     max_steps: int = 60
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-        """As many steps as it takes."""
+        """Run jaxopt's driver."""
         return _minimised("LevenbergMarquardt", problem, self.tolerance, self.max_steps)
 
 

@@ -1,4 +1,4 @@
-"""Knots inserted while a fit runs: nets and knot vectors with room to grow.
+"""`KnotInsertion`: knots inserted while a fit runs.
 
 Control points and knots live in arrays of fixed size. Behind the last control point in use lie surplus ones,
 and behind the knots as many repeats of the last knot; neither has any influence on the surface. So a fit
@@ -21,18 +21,18 @@ from jaxfit._splines._pieces import Axis, make_axis
 
 
 class KnotInsertion(eqx.Module):
-    """Every so many iterations a knot in the worst span of u and one in the worst span of v (section 4.1).
+    """Inserts a knot into the worst span of u, and one into that of v, every few iterations (section 4.1).
 
-    The worst span is the one whose points have the greatest sum of errors, along u and along v each; the
-    knot goes into its middle. The refinement is exact: the surface is the same before and after.
+    The worst span is the one whose points have the greatest sum of errors. The knot is inserted in its
+    middle. The refinement is exact: the surface does not change.
 
     Parameters
     ----------
     every : int
         Iterations from one insertion to the next (default 40).
     most : int
-        Most insertions in a fit (default 16). The net has room for so many from the beginning, or for as many
-        as `max_steps` permits, and a fit takes the longer, the more room.
+        The largest number of insertions in a fit (default 16). The net has room for all of them, or for as
+        many as `max_steps` permits, from the beginning. More room makes a fit slower.
 
     Raises
     ------
@@ -59,7 +59,7 @@ class KnotInsertion(eqx.Module):
         projection: Projection,
         counted: Bool[Array, " points"],
     ) -> WorkingSurface:
-        """The surface after iteration `step`, refined if it is time; only `counted` points matter."""
+        """The surface after iteration `step`, refined if it is time by the errors of `counted` points."""
         error = jnp.where(counted, projection.error, 0.0)
         return lax.cond(
             step % self.every == 0,
@@ -69,30 +69,30 @@ class KnotInsertion(eqx.Module):
 
 
 def room_for(insertion: KnotInsertion | None, surface: WorkingSurface, max_steps: Any) -> WorkingSurface:
-    """The surface with room for all knots that so many iterations may bring."""
+    """The surface with room for all knots that may be inserted within `max_steps` iterations."""
     if insertion is None:
         return surface
     return surface.padded(min(insertion.most, int(max_steps) // insertion.every))
 
 
 def check_insertion(insertion: Any) -> None:
-    """When there are new knots, or None for never."""
+    """Raise unless `insertion` is a KnotInsertion, or None for none."""
     if insertion is not None:
         check_kind("insertion", insertion, KnotInsertion, "KnotInsertion()")
 
 
 def refined(surface: WorkingSurface, u: Array, v: Array, error: Array) -> WorkingSurface:
-    """A knot more in the worst span of either direction, while there is room."""
+    """The surface with one more knot in the worst span of u and of v, while there is room."""
     net, knots_u, axis_u = _refined(surface.control_points, surface.knots_u, surface.axis_u, u, error)
-    turned = jnp.swapaxes(net, 0, 1)
-    turned, knots_v, axis_v = _refined(turned, surface.knots_v, surface.axis_v, v, error)
-    return WorkingSurface(jnp.swapaxes(turned, 0, 1), knots_u, knots_v, axis_u, axis_v)
+    transposed = jnp.swapaxes(net, 0, 1)
+    transposed, knots_v, axis_v = _refined(transposed, surface.knots_v, surface.axis_v, v, error)
+    return WorkingSurface(jnp.swapaxes(transposed, 0, 1), knots_u, knots_v, axis_u, axis_v)
 
 
 def _refined(
     net: Float[Array, "n m d"], knots: Float[Array, " knots"], axis: Axis, u: Array, error: Array
 ) -> tuple[Float[Array, "n m d"], Float[Array, " knots"], Axis]:
-    """Along the first axis."""
+    """Net, knots and axis with one more knot along the first direction."""
     count, order = net.shape[0], axis.polynomials.shape[1]
     total = jax.ops.segment_sum(error, axis.locate(u), axis.cells)
     span = jnp.argmax(total)

@@ -1,7 +1,7 @@
-"""Ways to solve the least-squares problem of a standard fit, as objects: the drivers of `optimistix`.
+"""`GaussNewton` and `LevenbergMarquardt`: solvers of the least-squares problem of `StandardApproximation`.
 
 All minimise the sum of squares of the same residual, [sqrt(w) (A P - Q); sqrt(lambda) L P], and agree to
-rounding. Neither needs a Jacobian of points times control points.
+rounding. None needs a dense Jacobian.
 """
 
 from abc import abstractmethod
@@ -27,14 +27,14 @@ class LeastSquaresProblem(eqx.Module):
     net: Float[Array, "nu nv d"]
 
     def residual(self, net: Float[Array, "nu nv d"]) -> Any:
-        """Of a net, whatever it says of control points that are not free."""
+        """The residual of a net; control points that are not free are those of `self.net`."""
         return self.system.residual(jnp.where(self.normal.free[:, :, None], net, self.net))
 
 
 def least_squares_problem(
     system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"]
 ) -> LeastSquaresProblem:
-    """The problem of improving `net`, whose control points `held` stay."""
+    """The problem of correcting `net`, whose control points `held` do not move."""
 
     def matrix(system: RegularisedSystem) -> tuple[Stencil, Array]:
         stencil = system.stencil()
@@ -49,14 +49,15 @@ class AbstractLeastSquares(eqx.Module):
 
     @abstractmethod
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-        """The net of least squares, and by what share of its diagonal a singular matrix was shifted."""
+        """The least-squares net, and the shift of a singular matrix as a share of its diagonal."""
 
 
 class GaussNewton(AbstractLeastSquares):
     """`optimistix.GaussNewton` with the structured normal equations as its linear solver (the default).
 
-    The residual is linear, so that one step solves it: moments of the points within cells, one Cholesky
+    The residual is linear, so one step solves it: moments of the points within cells, one Cholesky
     factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
+    This is a linear solver of `StandardApproximation`, not a fitting method of its own.
 
     Examples
     --------
@@ -69,8 +70,7 @@ class GaussNewton(AbstractLeastSquares):
         import optimistix as optx
 
         linear = StructuredSolver(problem)
-        # The residual is linear, so the first step is the solution: nothing is measured to tell whether it is
-        # the last, and it is not evaluated just to be accepted.
+        # The residual is linear, so the first step is the solution: no norm and no acceptance test is needed.
         solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
         return _free_part(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
 
@@ -78,15 +78,15 @@ class GaussNewton(AbstractLeastSquares):
 class LevenbergMarquardt(AbstractLeastSquares):
     """`optimistix.LevenbergMarquardt`, matrix-free: CG on products with the Jacobian and its transpose.
 
-    Knows nothing of the structure, and takes many passes over the points: an independent check, and a way for
-    systems too large for anything else.
+    It does not use the structure and takes many passes over the points: an independent check, and a fallback
+    for systems too large to factor.
 
     Parameters
     ----------
     tolerance : float
-        Relative and absolute, of the control points in units of the data's extent.
+        Relative and absolute tolerance of the control points, in units of the data's extent (default 1e-10).
     max_steps : int
-        Most steps of damping.
+        The largest number of steps (default 60).
 
     Examples
     --------
@@ -98,7 +98,7 @@ class LevenbergMarquardt(AbstractLeastSquares):
     max_steps: int = 60
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
-        """As many steps as it takes."""
+        """Run optimistix's driver."""
         import optimistix as optx
 
         eps = float(jnp.finfo(problem.net.dtype).eps)
@@ -112,7 +112,7 @@ class LevenbergMarquardt(AbstractLeastSquares):
 def _solution(solver: Any, problem: LeastSquaresProblem, steps: int) -> Any:
     import optimistix as optx
 
-    # Of what it is linearised at, the driver stores the arguments instead of a dozen arrays over the points.
+    # The driver stores the arguments of the residual instead of a dozen arrays over the points.
     @partial(jax.checkpoint, prevent_cse=False)
     def residual(net: Array, problem: LeastSquaresProblem) -> Any:
         return problem.residual(net)
@@ -128,8 +128,8 @@ def _free_part(problem: LeastSquaresProblem, net: Array) -> Array:
 class StructuredSolver(lx.AbstractLinearSolver):
     """Solves J x = r in the sense of least squares for the Jacobian J of one known problem.
 
-    The matrix J^T J is known as a stencil and factored once, before the driver starts; of the operator that
-    the driver hands over nothing is asked.
+    The matrix J^T J is known as a stencil and factored once, before the driver starts. The operator that the
+    driver passes is not used.
     """
 
     problem: LeastSquaresProblem
@@ -150,11 +150,11 @@ class StructuredSolver(lx.AbstractLinearSolver):
 
     @property
     def shift(self) -> Float[Array, ""]:
-        """By what share of its diagonal a singular matrix was shifted."""
+        """The shift of a singular matrix, as a share of its diagonal."""
         return getattr(self.state, "shift", jnp.zeros((), self.problem.net.dtype))
 
     def init(self, operator: Any, options: dict[str, Any]) -> Side:
-        """Nothing is left to do."""
+        """No work: the matrix has been factored."""
         return self.Side()
 
     def compute(self, state: Side, vector: Any, options: dict[str, Any]) -> Any:
@@ -176,5 +176,5 @@ class StructuredSolver(lx.AbstractLinearSolver):
         return state, options
 
     def assume_full_rank(self) -> bool:
-        """What is singular is shifted."""
+        """True: a singular matrix is shifted."""
         return True

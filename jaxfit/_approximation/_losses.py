@@ -1,4 +1,4 @@
-r"""What distances cost: losses that outliers do not dominate, as objects.
+r"""Robust losses: `Huber`, `Tukey` and `GemanMcClure`.
 
 A fit with a loss minimises $\sum_k w_k\, c^2 \rho(|e_k|^2 / c^2)$, where least squares has
 $\sum_k w_k |e_k|^2$. Its gradient is that of least squares with the weights $w_k \rho'(|e_k|^2 / c^2)$,
@@ -17,9 +17,9 @@ from jaxtyping import Float
 from jaxfit._checks import check_kind, check_number
 from jaxfit._fit._problem import Problem
 
-# The scale follows from the distance that this share of the points does not exceed, which is that many
-# standard deviations of residuals that are normally distributed along a normal. A median would stand more
-# outliers, but leave out all detail that a fit has not come to yet, and with it what would bring it there.
+# The scale follows from the distance that this share of the points does not exceed. Of normally distributed
+# residuals along a normal it is this many standard deviations. A median would resist more outliers, but it
+# would also remove the detail that a fit has not reached yet.
 SHARE, DEVIATIONS = 0.9, 1.6449
 
 
@@ -61,7 +61,7 @@ class AbstractLoss(eqx.Module):
 class Huber(AbstractLoss):
     r"""Distances beyond the scale c count $2 c |e| - c^2$: linearly, no more.
 
-    The objective stays convex in the distances, and outliers keep a bounded pull.
+    The objective stays convex in the distances, and the influence of an outlier is bounded.
 
     Parameters
     ----------
@@ -99,16 +99,16 @@ class Huber(AbstractLoss):
         return 1.0 / jnp.sqrt(jnp.maximum(square, 1.0))
 
 
-# The usual 4.685 is made for residuals that are normally distributed. Those of a fit have long tails where
-# detail is too fine for the net, and it would lose all of that.
+# The usual 4.685 suits normally distributed residuals. Those of a fit have long tails where detail is too
+# fine for the net, and this detail would be lost.
 TUKEY, GEMAN_MCCLURE = 14.0, 7.0
 
 
 class Tukey(AbstractLoss):
-    r"""Tukey's biweight: points farther than the scale c do not pull at all.
+    r"""Tukey's biweight: points farther than the scale c have no influence.
 
     $\rho(x) = (1 - (1 - x)^3) / 3$ up to 1. From a base surface far from the points, let the scale follow
-    from the errors, or nothing may pull.
+    from the errors; otherwise no point may have influence.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class Tukey(AbstractLoss):
 
 
 class GemanMcClure(AbstractLoss):
-    r"""$\rho(x) = x / (1 + x)$: the pull of far points fades like the fourth power of their distance.
+    r"""$\rho(x) = x / (1 + x)$: the weight of far points falls with the fourth power of their distance.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class GemanMcClure(AbstractLoss):
 
 
 def check_loss(loss: Any) -> None:
-    """A loss, or None for least squares."""
+    """Raise unless `loss` is a loss, or None for least squares."""
     if loss is not None:
         check_kind("loss", loss, AbstractLoss, "Huber()")
 
@@ -191,12 +191,12 @@ def loss_length(loss: AbstractLoss | None, problem: Problem, error: Any) -> Any:
 
 
 def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:
-    """How much points pull at distances `error`."""
+    """The weights of points at distances `error`, w rho'."""
     return weight if loss is None else weight * loss.derivative((error / length) ** 2)
 
 
 def total_cost(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Float[Array, ""]:
-    """The objective without its thin plate."""
+    """The data term of the objective."""
     if loss is None:
         return jnp.sum(weight * error**2)
     return jnp.sum(weight * loss.cost((error / length) ** 2)) * length**2

@@ -1,4 +1,4 @@
-"""Momentum: where an iteration has been going for a while, it goes farther."""
+"""`Nesterov`: accelerated gradient steps."""
 
 from typing import Any
 
@@ -15,29 +15,29 @@ LARGEST_RELAXATION = 4 / 3
 
 
 class Momentum(eqx.Module):
-    """The net that the last step led to, and how far Nesterov's sequence of weights has come."""
+    """The net X_n that the last step led to, and t_n."""
 
     net: Float[Any, "nu nv d"]
     weight: Float[Any, ""]
 
 
 def at_rest(net: Any) -> Momentum:
-    """Before a net has moved."""
+    """No momentum."""
     xp: Any = np if is_concrete(net) else jnp
     return Momentum(net, xp.ones((), net.dtype))
 
 
 class Nesterov(eqx.Module):
-    r"""Nesterov's acceleration: the next surface lies beyond the net that a step has led to.
+    r"""Nesterov's acceleration: the net is extrapolated along its last move.
 
-    With $X_n$ the nets that the steps lead to, the next step starts from
+    With $X_n$ the net after step n, the next step starts from
 
     $$P_n = X_n + \frac{t_n - 1}{t_{n+1}} (X_n - X_{n-1}), \qquad
       t_{n+1} = \tfrac{1}{2} \Big(1 + \sqrt{1 + 4 t_n^2}\Big), \qquad t_1 = 1.$$
 
-    Plain steps take a number of iterations that grows with the condition of the problem, these one that grows
-    with its square root. The sequence begins anew whenever the average error has risen, and where fairing or
-    new knots have changed the net.
+    The number of plain steps grows with the condition number of the problem, that of accelerated steps with
+    its square root. The sequence restarts whenever the average error has risen, and where fairing or new
+    knots have changed the net.
 
     Source: Y. Nesterov, Soviet Mathematics Doklady 27, 1983; B. O'Donoghue and E. Candes, Adaptive restart
     for accelerated gradient schemes, Foundations of Computational Mathematics 15, 2015.

@@ -1,12 +1,12 @@
-r"""What a step on the true distances leaves to second order, gathered onto the control points.
+r"""The right-hand side of the second-order correction of a step of `OrthogonalDistance`.
 
 Under a move $M = B\,dP$ of the surface, with tangential coordinates $m = (J^T J)^{-1} J^T M$, feet slide by
-$du = H^{-1} (M_\alpha \cdot e - J^T M)$, H and e as for the rows of the step. The normal part of the residual
-$R(u^*(P)) - Q$ has the derivative $\Pi M$, and turning $\Pi$ and M with the foot the second derivative
+$du = H^{-1} (M_\alpha \cdot e - J^T M)$, H and e as in `_distance_rows.py`. The normal part of the residual
+$R(u^*(P)) - Q$ has the derivative $\Pi M$. Its second derivative, with the foot moving along, is
 
 $$\Pi \big(M_\alpha (du^\alpha - m^\alpha) - R_{\alpha\beta}\, m^\alpha du^\beta\big).$$
 
-Where a net slides along its surface this is all there is, for then $\Pi M$ is nearly 0.
+Where a net slides along its surface this is the leading term, for then $\Pi M$ is nearly 0.
 """
 
 from typing import Any
@@ -77,8 +77,8 @@ def _second_derivative_at(
     e = target - jet.value
     free = FreeTangents.at(pieces, u, v, e, jet)
     along = free.coordinates(value)
-    pull = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
-    slide, valid = _slide(free, e, jet, along, pull)
+    right = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
+    slide, valid = _slide(free, e, jet, along, right)
     (ms, mt), (ds, dt) = ([x[None] for x in pair] for pair in (along, slide))
     second = value_s * (ds - ms) + value_t * (dt - mt)
     second -= jet.ss * ms * ds + jet.st * (ms * dt + mt * ds) + jet.tt * mt * dt
@@ -86,11 +86,11 @@ def _second_derivative_at(
 
 
 def _slide(
-    free: FreeTangents, e: Array, jet: Jet, along: tuple[Array, Array], pull: tuple[Array, Array]
+    free: FreeTangents, e: Array, jet: Jet, along: tuple[Array, Array], right: tuple[Array, Array]
 ) -> tuple[tuple[Array, Array], Array]:
-    """How feet move, and whether that is to be relied on: near the surface, measured by its curvature.
+    """The moves of the feet, and whether these are valid: near the surface, by its radii of curvature.
 
-    To first order in the distance where a foot is not free in both directions.
+    Where a foot is not free in both directions, its move is to first order in the distance.
     """
     E, F, G = dot(jet.s, jet.s), dot(jet.s, jet.t), dot(jet.t, jet.t)
     a, b, c = E - dot(e, jet.ss), F - dot(e, jet.st), G - dot(e, jet.tt)
@@ -98,5 +98,5 @@ def _slide(
     valid = (a > LEAST_SHARE * E) & (determinant > LEAST_SHARE**2 * (E * G - F * F))
     both = valid & (free.per_first > 0) & (free.per_second > 0)
     inverse = 1.0 / jnp.where(both, determinant, 1.0)
-    ds, dt = (c * pull[0] - b * pull[1]) * inverse, (a * pull[1] - b * pull[0]) * inverse
+    ds, dt = (c * right[0] - b * right[1]) * inverse, (a * right[1] - b * right[0]) * inverse
     return (jnp.where(both, ds, -along[0]), jnp.where(both, dt, -along[1])), valid

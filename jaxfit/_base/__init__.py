@@ -1,4 +1,4 @@
-"""A first surface from four boundary polylines."""
+"""Base surfaces: a first surface from four boundary polylines, and from the cloud where a method uses it."""
 
 from jaxfit._base._base_method import AbstractBaseMethod as AbstractBaseMethod
 from jaxfit._base._base_method import Coons as Coons

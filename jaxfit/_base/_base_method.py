@@ -1,4 +1,4 @@
-"""What fills the inside of a base surface: the choice is an object."""
+"""`Coons`, and the abstract class of the methods that make the inside of a base surface."""
 
 from abc import abstractmethod
 from typing import Any
@@ -27,7 +27,7 @@ class AbstractBaseMethod(eqx.Module):
 
 
 class Coons(eqx.Module):
-    """The Coons surface of the boundary itself, equations (6)-(7); it does not look at the points.
+    """The Coons surface of the boundary itself, equations (6)-(7); it does not use the points.
 
     Parameters
     ----------

@@ -47,14 +47,14 @@ def base_surface(
     boundary : Boundary
         Four polylines in d dimensions, any unit, any number of vertices.
     points : array (N, d), optional
-        The cloud. The Coons surface does not look inside: for it the cloud serves only to measure
-        the size, of which `tolerance` is a fraction. The other methods need it.
+        The cloud. The Coons surface uses it only to measure the size of which `tolerance` is a fraction.
+        The other methods need it.
     net : (nu, nv), optional
         Control points along u and v, exactly. Without it each curve takes as many as `tolerance`
         asks for (at least its order, at most 64), and the net is the refinement of opposite
         curves to their common knots, which does not change their shape. Knots of opposite
         curves closer than 0.02 of the domain and half a mean span are made equal before the fit.
-        Methods that look at the cloud then refine it, where it is smaller, to about one control
+        Methods that use the cloud then refine it, where it is smaller, to about one control
         point for every eight points, at most 64 each way.
     order : (K, L)
         Degree + 1 along u and v, each 2 to 8.

@@ -171,8 +171,8 @@ def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) ->
 
 def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
     for flips in sorted(product((1, -1), repeat=4), reverse=True):
-        turned = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
-        if max(_corner_gaps(turned)) <= allowed:
+        reversed_lines = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
+        if max(_corner_gaps(reversed_lines)) <= allowed:
             names = [n for n, f in zip(lines, flips, strict=True) if f < 0]
             return f"reverse {' and '.join(names)}"
     return "make the polylines share their corner points"

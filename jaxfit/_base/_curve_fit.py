@@ -12,7 +12,7 @@ from jaxtyping import Array
 from jaxfit._splines._basis import spans_and_weights
 from jaxfit._splines._insertion import insert_along
 
-CHECK_EVERY = 8  # steps between two looks at whether the error still falls
+CHECK_EVERY = 8  # steps between two checks that the error still falls
 
 
 class CurveStart(NamedTuple):
@@ -48,7 +48,7 @@ class _Feet(NamedTuple):
 class _State(NamedTuple):
     control: Array
     feet: Array
-    reference: Array  # average error at the last look
+    reference: Array  # average error at the last check
     step: Array
     done: Array
 
@@ -127,13 +127,13 @@ def _step(problem: _Problem, state: _State, tolerance: Array, order: int) -> _St
     den = sums[:, -1:]
     moves = sums[:, :-1] / jnp.where(den > 0, den, 1)  # zero where no point touches
     average = jnp.sum(problem.weights * _lengths(foot.errors)) / jnp.sum(problem.weights)
-    look = (state.step % CHECK_EVERY) == CHECK_EVERY - 1
+    check = (state.step % CHECK_EVERY) == CHECK_EVERY - 1
     return _State(
         state.control + problem.free * moves,
         foot.u,
-        jnp.where(look, average, state.reference),
+        jnp.where(check, average, state.reference),
         state.step + 1,
-        (average <= tolerance) | (look & (average > 0.99 * state.reference)),
+        (average <= tolerance) | (check & (average > 0.99 * state.reference)),
     )
 
 
@@ -144,10 +144,11 @@ def _projected(problem: _Problem, control: Array, feet: Array, order: int) -> _F
     """
     here, (first, second) = _located(problem, control, feet, order, (1, 2))
     slope = jnp.sum(first * first, axis=-1)
-    bend = slope - jnp.sum(here.errors * second, axis=-1)
-    # Far off the curve the second-order term may turn the step round: Gauss-Newton instead.
-    bend = jnp.where(bend > 0.1 * slope, bend, slope)
-    step = jnp.sum(here.errors * first, axis=-1) / jnp.where(bend > 0, bend, 1)
+    second_derivative = slope - jnp.sum(here.errors * second, axis=-1)
+    # Far off the curve the second-order term may reverse the step: Gauss-Newton instead.
+    curved = second_derivative > 0.1 * slope
+    scale = jnp.where(curved, second_derivative, slope)
+    step = jnp.sum(here.errors * first, axis=-1) / jnp.where(scale > 0, scale, 1)
     start, stop = problem.knots[0], problem.knots[-1]
     reach = (stop - start) / 16
     moved = jnp.clip(feet + jnp.clip(step, -reach, reach), start, stop)

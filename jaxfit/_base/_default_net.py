@@ -1,4 +1,4 @@
-"""How many control points a cloud can carry."""
+"""The default number of control points for a cloud."""
 
 import numpy as np
 

@@ -16,12 +16,12 @@ from jaxfit._base._point_normals import frames, oriented
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many
 WIDTH = 4  # times the neighbours asked for: the most that symmetry may add
-COCIRCULAR = 1e-7  # sine of a turn of the hull that still counts as straight on, or as none
+COCIRCULAR = 1e-7  # sine of an angle of the hull that still counts as straight
 STEEP = 3  # powers of the cosine that a step out of the plane is lengthened by
 LEAST = 0.05  # the least such cosine
 WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than this
 ACROSS = 1000  # points with a wide gap that may be neighbours across it
-ENTRIES = 1 << 20  # of arrays at once, when those are looked for
+ENTRIES = 1 << 20  # of arrays at once, in the search for these
 
 
 class Stars(NamedTuple):
@@ -41,17 +41,17 @@ class _Planes(NamedTuple):
     normals: np.ndarray | None  # (points, 3)
 
 
-def stars(points: Float[Any, "points d"], count: int, pinned: int = 0) -> Stars:
+def stars(points: Float[Any, "points d"], count: int, fixed: int = 0) -> Stars:
     """The stars among about `count` neighbours, d >= 2; no two points may coincide.
 
-    Those with a wide gap, but of the first `pinned` points, are looked for once more among all that have one:
-    across a hole its rim's points are neighbours, or the hole would grow.
+    Points with a wide gap, except the first `fixed` ones, get a second search among all points that have one:
+    the points on the rim of a hole are then neighbours across it. Otherwise the hole would grow.
     """
     members, filled = neighbourhoods(points, count)
     planes = _planes(points, members, filled)
     star = _among(planes, np.arange(len(points)), members, filled)
     gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
-    rows = gaping[gaping >= pinned]
+    rows = gaping[gaping >= fixed]
     at_once = max(ENTRIES // min(len(gaping) + 1, ACROSS), 1)
     for k in range(0, len(rows), at_once):
         part = rows[k : k + at_once]

@@ -1,4 +1,4 @@
-"""Where the cloud pulls a grid of surface points along their normals (Azariadis 2004)."""
+"""Displacements of a grid of surface points along their normals towards a cloud (Azariadis 2004)."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxfit._base._host_splines import Frame
 
 AT_ONCE = 4_000_000  # pairs of grid point and cloud point in memory
-PRESENCE = 0.25  # of one point on the normal line: a pull by so little counts half
+PRESENCE = 0.25  # the sum of weights at which the confidence is 1/2; one point on the normal line has 1
 NEAREST = 8  # cloud points whose mean distance bounds the reach
 NARROWEST = 0.3  # of the median: the least spacing of a grid that counts
 FINEST = 1e-9  # of the diagonal: the least reach
@@ -21,7 +21,7 @@ def directed_projection(
     reach: Float[Any, " grid"],
     points: Float[Any, "points 3"],
 ) -> tuple[Float[Any, " grid"], Float[Any, " grid"]]:
-    r"""How far to move each grid point along its normal, and how much the cloud has to say there, 0 to 1.
+    r"""The displacement of each grid point along its normal, and its confidence, 0 to 1.
 
     The point p + t n with the least weighted sum of squared distances from the cloud is at
 
@@ -29,8 +29,8 @@ def directed_projection(
               w_m = e^{-r_m^2 / 2 h^2} / (1 + d_m^2 / h^2)^2 ,
 
     d the distance of the cloud point from p and r from the normal line. With h, the `reach`, about the
-    spacing of the grid, what lies off the line hardly counts, and of several sheets on the line the near one
-    does. Where nothing is near the line the confidence falls to 0, and t means nothing.
+    spacing of the grid, points off the line hardly count, and of several sheets on the line the nearest
+    counts most. Where no point is near the line the confidence falls to 0, and t has no meaning.
     """
     moves, sure = np.zeros(len(grid)), np.zeros(len(grid))
     step = max(1, AT_ONCE // max(len(points), 1))

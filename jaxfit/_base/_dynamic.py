@@ -52,7 +52,7 @@ class DynamicBaseSurface(AbstractBaseMethod):
     Notes
     -----
     Three dimensions only. Where no cloud point is near a normal line, the surface bends as the smoothing
-    asks. Gross outliers pull only where nothing nearer lies on the line.
+    asks. Gross outliers have influence only where nothing nearer lies on the line.
 
     Fails where normals of the first surface do not lead to the cloud, and cannot follow what overhangs more
     than the moved normals see: ears become lumps, which a fit then has to open. Where the cloud bends
@@ -61,8 +61,8 @@ class DynamicBaseSurface(AbstractBaseMethod):
     it works at all. Takes 2 to 10 s for a net of 42 x 42 on one core.
 
     Departs from the source, of which the weights and the growth follow the summary in section 2.3 of
-    the paper: displacements are smoothed rather than positions, and a pull counts less where few
-    points are near the normal line.
+    the paper: displacements are smoothed rather than positions, and a displacement counts less
+    where few points are near the normal line.
 
     Source: P. N. Azariadis, Parameterization of clouds of unorganized points using dynamic base surfaces,
     Computer-Aided Design 36 (2004).

@@ -1,4 +1,4 @@
-"""Smoothing of a moved grid: a plate through what is sure, over what is not."""
+"""Smoothing of the displacements of a grid, weighted by their confidence."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ def smoothed(moves: Float[Any, "a b d"], sure: Float[Any, "a b"], stiffness: flo
               + \mu \sum |\Delta_i^2 D|^2 + |\Delta_j^2 D|^2 ,
 
     T the moves, c (0 to 1) how sure each is, and second differences along both directions. Displacements
-    rather than positions: without pull, the grid keeps the shape it started with.
+    rather than positions: where the confidence is 0 the grid keeps its shape.
     """
     from scipy.sparse import diags_array, eye_array, kron
     from scipy.sparse.linalg import splu

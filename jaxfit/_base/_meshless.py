@@ -44,7 +44,7 @@ class Meshless(AbstractBaseMethod):
         slack plate would shoot out beside them; and up to twice if that removes folds across a hole.
     robust : int
         Rounds in which points lose weight, $w = 1 / (1 + (r / 20 \bar r)^2)$ with r their distance and
-        $\bar r$ the median (default 3), so that gross outliers do not pull.
+        $\bar r$ the median (default 3), so that gross outliers have little influence.
     most_points : int
         A larger cloud is thinned evenly to so many (default 30,000).
 

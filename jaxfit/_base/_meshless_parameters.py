@@ -54,7 +54,7 @@ def meshless_parameters(
     boundary : Boundary
         Four polylines. Nodes are added to sides whose edges are longer than the cloud's spacing.
     neighbours : int
-        At least 6 (default 24): among how many of the nearest points the star is looked for.
+        At least 6 (default 24): the number of nearest points among which the star is searched.
     reweightings : int
         Most reweightings by stretch (default 4); 0 for the linear system alone.
 
@@ -71,7 +71,7 @@ def meshless_parameters(
 
     Notes
     -----
-    Duplicates count once. Points around a hole look for neighbours across it as well, so that it keeps its
+    Duplicates count once. Points around a hole have neighbours across it as well, so that it keeps its
     size. Groups of points whose neighbours are all their own are tied to the nearest
     point outside. A point outside the boundary gets parameters inside the square, near those of its
     neighbours. Results do not depend on the order of points, nor, beyond rounding, on translation, rotation
@@ -115,8 +115,8 @@ def parameters_of(
 ) -> Float[Any, "points 2"]:
     """The same for distinct points and sides of size one."""
     nodes = _nodes(points, sides)
-    pinned = len(nodes.fixed)
-    star = stars(nodes.points, neighbours, pinned)
+    fixed = len(nodes.fixed)
+    star = stars(nodes.points, neighbours, fixed)
     weights = mean_value_weights(star)
     places = _solved(nodes, star, weights)
     for _ in range(UNLINKINGS):
@@ -124,16 +124,16 @@ def parameters_of(
         if (cut == 1).all():
             break
         places = _solved(nodes, star, weights * cut)
-    stretch, spread = area_stretch(star, nodes.points, places, pinned)
+    stretch, spread = area_stretch(star, nodes.points, places, fixed)
     for _ in range(reweightings):
         weights = weights / stretch[star.members]
         trial = _solved(nodes, star, weights * link_weights(star, nodes.points, places))
-        stretch, found = area_stretch(star, nodes.points, trial, pinned)
+        stretch, found = area_stretch(star, nodes.points, trial, fixed)
         if not found < spread:
             break
         places, spread = trial, found
     result = nodes.place.copy()
-    result[nodes.free] = places[pinned:]
+    result[nodes.free] = places[fixed:]
     return result
 
 
@@ -174,28 +174,28 @@ def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "node
     from scipy.sparse import csr_array, diags_array, eye_array
     from scipy.sparse.linalg import splu
 
-    count, pinned = len(nodes.points), len(nodes.fixed)
+    count, fixed = len(nodes.points), len(nodes.fixed)
     i = np.repeat(np.arange(count), star.filled.sum(axis=1))
     weights = weights / weights.sum(axis=1, keepdims=True)
     graph = csr_array((weights[star.filled], (i, star.members[star.filled])), shape=(count, count))
-    graph = _connect_components(graph, nodes.points, pinned)
+    graph = _connect_components(graph, nodes.points, fixed)
     graph = diags_array(1 / graph.sum(axis=1)) @ graph
-    if count == pinned:
+    if count == fixed:
         return nodes.fixed
-    free = graph[pinned:]
-    system = eye_array(count - pinned) - free[:, pinned:]
+    free = graph[fixed:]
+    system = eye_array(count - fixed) - free[:, fixed:]
     factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    inner = factors.solve(free[:, :pinned] @ nodes.fixed)
+    inner = factors.solve(free[:, :fixed] @ nodes.fixed)
     return np.concatenate([nodes.fixed, np.clip(inner, 0.0, 1.0)])
 
 
-def _connect_components(graph: Any, points: np.ndarray, pinned: int) -> Any:
+def _connect_components(graph: Any, points: np.ndarray, fixed: int) -> Any:
     """The graph with links for groups of points from which no path leads to the boundary."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    lost = ~_reaching(graph, pinned)
+    lost = ~_reaching(graph, fixed)
     if not lost.any():
         return graph
     rows, rest = np.flatnonzero(lost), np.flatnonzero(~lost)
@@ -210,13 +210,13 @@ def _connect_components(graph: Any, points: np.ndarray, pinned: int) -> Any:
     return graph + both + csr_array(links, shape=graph.shape)
 
 
-def _reaching(graph: Any, pinned: int) -> np.ndarray:
+def _reaching(graph: Any, fixed: int) -> np.ndarray:
     """Whether a path along the neighbours leads from each point to the boundary."""
     from scipy.sparse import csr_array, vstack
     from scipy.sparse.csgraph import breadth_first_order
 
     count = graph.shape[0]
-    ends = csr_array(np.concatenate([np.ones(pinned), np.zeros(count - pinned)])[None])
+    ends = csr_array(np.concatenate([np.ones(fixed), np.zeros(count - fixed)])[None])
     start = vstack([graph.T, ends]).tocsr()  # one more node, which leads to the whole boundary
     square = csr_array((start.data, start.indices, start.indptr), shape=(count + 1, count + 1))
     found = np.zeros(count + 1, bool)

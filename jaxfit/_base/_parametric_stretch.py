@@ -12,14 +12,14 @@ STEEPEST = 5.0  # times the median: the most that a stretch counts in one reweig
 
 
 def area_stretch(
-    star: Stars, points: Float[Any, "points d"], places: Float[Any, "points 2"], pinned: int
+    star: Stars, points: Float[Any, "points d"], places: Float[Any, "points 2"], fixed: int
 ) -> tuple[Float[Any, " points"], float]:
     r"""Stretch around each free point, as multiples of the median, and its spread.
 
     The stretch is $\sigma = \sqrt{A / A_{uv}}$ with the areas of the star in space and in the domain; its
     spread is the standard deviation of $\log \sigma$. Areas of whole stars rather than the stretch of
     each triangle (Sander et al. 2001): a single triangle turned over, as stars that do not quite agree
-    contain, would outweigh all others. The first `pinned` points and those without area have 1.
+    contain, would outweigh all others. The first `fixed` points and those without area have 1.
     """
     after = around(star.members, star.filled)[1]
     inside = star.filled & (star.angle < WIDEST)
@@ -29,7 +29,7 @@ def area_stretch(
     a, b = places[star.members] - places[:, None], places[after] - places[:, None]
     signed = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     shadow = np.abs(np.sum(np.where(inside, signed, 0.0), axis=1))
-    counts = (area > 0) & (shadow > 0) & (np.arange(len(points)) >= pinned)
+    counts = (area > 0) & (shadow > 0) & (np.arange(len(points)) >= fixed)
     if not counts.any():
         return np.ones(len(points)), 0.0
     stretch = np.sqrt(area[counts] / shadow[counts])

@@ -1,4 +1,4 @@
-"""Normals of scattered points: the plane of the neighbours, turned to one side by a spanning tree."""
+"""Normals of scattered points: planes through neighbours, oriented along a spanning tree."""
 
 from typing import Any
 
@@ -40,8 +40,8 @@ def oriented(
     count = len(normals)
     slope = np.abs(np.sum(unit * normals[:, None], axis=2))
     other = np.abs(np.sum(unit * normals[members], axis=2))
-    turn = 1 - np.abs(np.sum(normals[members] * normals[:, None], axis=2))
-    cost = 1e-9 + np.maximum(slope, other) ** 2 + turn
+    deviation = 1 - np.abs(np.sum(normals[members] * normals[:, None], axis=2))
+    cost = 1e-9 + np.maximum(slope, other) ** 2 + deviation
     rows = np.broadcast_to(np.arange(count)[:, None], members.shape)
     graph = csr_array((cost[filled], (rows[filled], members[filled])), shape=(count, count))
     tree = minimum_spanning_tree(graph)

@@ -87,11 +87,11 @@ class Search:
         who, sample = [], []
         for count, is_last in ((x, x == NEIGHBOURS[-1]) for x in NEIGHBOURS):
             near, index = self._query(points[which], count)
-            reach, step, bent = distance[which], self.step_bound[index], self.curvature_bound[index]
-            open_ = near**2 <= reach**2 + step + reach * bent
+            reach, step, curvature = distance[which], self.step_bound[index], self.curvature_bound[index]
+            open_ = near**2 <= reach**2 + step + reach * curvature
             crowded = np.zeros(len(which), bool)
             if near.shape[0] < self.tree.n and not is_last:
-                crowded = self._is_crowded(near[-1], reach, step, bent)
+                crowded = self._is_crowded(near[-1], reach, step, curvature)
                 open_ &= ~crowded
             row, column = np.nonzero(open_)
             there = index[row, column]
@@ -104,12 +104,12 @@ class Search:
         return np.concatenate(who), np.concatenate(sample)
 
     def _is_crowded(
-        self, last: np.ndarray, reach: np.ndarray, step: np.ndarray, bent: np.ndarray
+        self, last: np.ndarray, reach: np.ndarray, step: np.ndarray, curvature: np.ndarray
     ) -> np.ndarray:
         """Where samples farther than the last may matter, having at most WIDER times the bounds of these."""
-        most_step, most_bent = self.most
+        most_step, most_curved = self.most
         wide = np.minimum(most_step, WIDER * step.max(axis=0))
-        return last**2 <= reach**2 + wide + reach * np.minimum(most_bent, WIDER * bent.max(axis=0))
+        return last**2 <= reach**2 + wide + reach * np.minimum(most_curved, WIDER * curvature.max(axis=0))
 
     def is_local_minimum(self, point: np.ndarray, sample: np.ndarray) -> np.ndarray:
         """Whether none of the eight samples around `sample` is nearer to the point.

@@ -108,7 +108,7 @@ def closest_point(
         around control points and queries). Default 1e-12 in float64, 1e-5 in float32.
     max_steps : int
         At least 1. About as many evaluations are spent on a point, from each start and in each of the places
-        it is looked for, before it counts as not converged.
+        it is searched, before it counts as not converged.
 
     Returns
     -------
@@ -123,8 +123,8 @@ def closest_point(
     -----
     Newton's method on the squared distance with the domain as bounds (an active set), or the iteration of
     Hu and Wallner (2005). Knots of multiplicity order - 1, where the tangent may jump, are treated as
-    borders between smooth parts. Feet that do not converge are looked for on the four border curves
-    (section 3.1 of the paper) and say so. A foot also counts as found where the last two steps foresee, by
+    borders between smooth parts. Feet that do not converge are searched on the four border curves
+    (section 3.1 of the paper) and say so. A foot also counts as found where the last two steps predict, by
     quadratic convergence, a tangential residual below a hundredth of the tolerance, which saves one.
 
     The global search can miss the nearest foot where samples are very uneven: next to an edge collapsed to a

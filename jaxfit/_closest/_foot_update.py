@@ -1,4 +1,4 @@
-"""Feet brought up to date with a surface that has moved, and sums over the points at them."""
+"""`update_feet`: local feet on a surface that has moved, and sums over the points there."""
 
 from typing import Any
 
@@ -41,12 +41,12 @@ def update_feet(
     sums: PointSums | None = None,
     weight: Float[Array, " points"] | None = None,
 ) -> tuple[FootUpdate, Any]:
-    r"""Local feet of `target` from the last ones (u, v), and what `sums` makes of the residuals there.
+    r"""Local feet of `target` from the last ones (u, v), and the `sums` over the residuals there.
 
     `tolerance` is the largest tangential part of a residual, a length; `idle` points stay where they are and
     take no part. `within` are bounds (low_u, high_u, low_v, high_v) of every foot's own. `weight` is how much
-    each point counts in the sums, 1 without it. Feet that are not found within `max_steps` evaluations
-    count by the best there is.
+    each point counts in the sums, 1 without it. A foot that is not found within `max_steps` evaluations
+    is the best point so far.
 
     Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
     \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.

@@ -63,8 +63,8 @@ def project(
     within: Border | None = None,
 ) -> Feet:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, which may be traced, feet that do not converge are looked for on the four
-    border curves (section 3.1 of the paper). With `within`, bounds of every foot's own, feet are looked for
+    they are. With `borders`, which may be traced, feet that do not converge are searched on the four
+    border curves (section 3.1 of the paper). With `within`, bounds for each foot, feet are searched
     nowhere else.
 
     The coordinates must be small against nothing but their own extent (centre them first): rounding is

@@ -48,8 +48,8 @@ def sample(net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Sam
     points = np.ascontiguousarray(jet[0, 0].transpose(0, 2, 1))
     neighbours = (_squared_gap(jet[0, 0], i, j) for i, j in ((1, 0), (0, 1), (1, 1), (1, -1)))
     step_bound = 0.25 * STEP_SAFETY * reduce(np.maximum, neighbours)
-    bent = CURVATURE_SAFETY * _normal_part(jet, 1.0 / count_u, 1.0 / count_v)
-    return Samples(u, v, points, step_bound, bent, axis_u.first[cell_u], axis_v.first[cell_v])
+    curvature_bound = CURVATURE_SAFETY * _normal_part(jet, 1.0 / count_u, 1.0 / count_v)
+    return Samples(u, v, points, step_bound, curvature_bound, axis_u.first[cell_u], axis_v.first[cell_v])
 
 
 def sample_points(net: Any, axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, Any]:

@@ -1,4 +1,4 @@
-"""What all fits share: the loop, the reasons it stops for, the history and the result."""
+"""What all fits share: the loop, the contract of methods, the history and the result."""
 
 from jaxfit._fit._border import FixedBorder as FixedBorder
 from jaxfit._fit._border import FixedCorners as FixedCorners

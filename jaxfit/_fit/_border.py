@@ -1,4 +1,4 @@
-"""Which control points a fit holds."""
+"""`FixedBorder`, `FixedCorners`, `FreeBorder`, `FixedSides`: which control points do not move."""
 
 from abc import abstractmethod
 from typing import Any
@@ -12,15 +12,18 @@ from jaxfit._checks import check_switches, is_concrete
 
 
 class AbstractBorder(eqx.Module):
-    """Which control points on the border of the net stay where they are."""
+    """Which control points on the border of the net do not move."""
 
     @abstractmethod
     def held(self, ends_u: Any, ends_v: Any) -> Bool[Any, "nu nv"]:
-        """The mask, from marks (2, nu) and (2, nv) of the first and last row and column of the net."""
+        """The mask of control points that do not move.
+
+        `ends_u` (2, nu) and `ends_v` (2, nv) are True at the first and the last row and column of the net.
+        """
 
 
 class FixedBorder(AbstractBorder):
-    """All control points on the border stay: the border curves of the base surface are kept.
+    """No control point on the border moves: the border curves of the base surface are kept.
 
     Section 2.3 of Kineri, Wang, Lin and Maekawa (2012). The default of the fits.
 
@@ -37,7 +40,7 @@ class FixedBorder(AbstractBorder):
 
 
 class FixedCorners(AbstractBorder):
-    """Only the four corners stay, and the border curves are fitted.
+    """Only the four corners do not move; the border curves are fitted.
 
     Examples
     --------
@@ -52,7 +55,7 @@ class FixedCorners(AbstractBorder):
 
 
 class FreeBorder(AbstractBorder):
-    """No control point stays: an ordinary least-squares fit.
+    """All control points move: an ordinary least-squares fit.
 
     Examples
     --------
@@ -67,12 +70,12 @@ class FreeBorder(AbstractBorder):
 
 
 class FixedSides(AbstractBorder):
-    """Some sides stay, the other ones are fitted.
+    """Some sides do not move; the other ones are fitted.
 
     Parameters
     ----------
     u0, u1, v0, v1 : bool
-        Whether the side u = 0, u = 1, v = 0 or v = 1 stays, its corners included (default False).
+        Whether the side u = 0, u = 1, v = 0 or v = 1 is fixed, its corners included (default False).
 
     Raises
     ------
@@ -95,13 +98,15 @@ class FixedSides(AbstractBorder):
         check_switches(self, ("u0", "u1", "v0", "v1"))
 
     def held(self, ends_u: Any, ends_v: Any) -> Bool[Any, "nu nv"]:
-        """The sides that were named."""
+        """The chosen sides."""
         along_u = (ends_u[0] & self.u0) | (ends_u[1] & self.u1)
         return along_u[:, None] | ((ends_v[0] & self.v0) | (ends_v[1] & self.v1))[None, :]
 
 
 def held_points(border: AbstractBorder, shape: tuple[int, ...], used: Any) -> Bool[Any, "nu nv"]:
-    """The control points that `border` holds, and surplus ones; `used` (2,) are those in use.
+    """The control points that do not move: those that `border` holds, and surplus ones.
+
+    `shape` begins with (nu, nv); `used` (2,) says how many of these are in use.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Feet brought up to date on a surface that has moved."""
+"""Projects the points of a problem onto a surface: clouds with `update_feet`, grids with `project`."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def measure_feet(
     before: Projection,
     foot_tolerance: Any,
 ) -> Projection:
-    """Local feet from the last ones, converged on the surface, and the errors there."""
+    """Converged local feet, starting from the last ones, and the errors there."""
     idle, tolerance = ~jnp.asarray(problem.real), foot_tolerance * problem.diagonal
     feet, _ = update_feet(method, pieces, problem.target, before.u, before.v, tolerance, idle=idle)
     active = jnp.sum(problem.counted, dtype=jnp.int32)
@@ -37,9 +37,9 @@ def measure_grid(
     held: Bool[Any, " points"],
     within: Border | None = None,
 ) -> Projection:
-    """Feet of a grid's points, but those that are `held`; where they do not converge, on the borders.
+    """Feet of a grid's points, except those that are `held`.
 
-    `within` are bounds of every foot's own.
+    Feet that do not converge are searched on the borders. `within` are bounds for each foot.
     """
     feet = project(
         method,
@@ -59,7 +59,7 @@ def measure_grid(
 
 
 def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> Border:
-    """Bounds of the feet of a grid's points, such that those of border points stay on their border."""
+    """Bounds that keep the feet of a grid's border points on their border curves."""
     bounds = []
     for axis, number in zip(axes, (np.arange(nu)[:, None], np.arange(nv)[None, :]), strict=True):
         low, high = axis.breaks[0], axis.breaks[-1]

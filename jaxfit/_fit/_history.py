@@ -1,4 +1,4 @@
-"""What happened in every iteration: in the loop, and as users see it."""
+"""`ErrorHistory`, the record of the loop, and `History`, the same for users."""
 
 import dataclasses
 from typing import Any
@@ -17,11 +17,11 @@ MOST_ENTRIES = 1 << 16  # the last so many iterations are kept
 
 
 class ErrorHistory(eqx.Module):
-    """One entry for each iteration, NaN where there has been none; the oldest are written over.
+    """One entry for each iteration, NaN where there is none yet. New entries replace the oldest ones.
 
-    Rows of `errors`: average and maximum error as fractions of the diagonal, evaluations of the surface for a
-    foot, and change of its parameters since the iteration before, both on average. Rows of `counts`: points
-    that took part, and control points along u and v.
+    Rows of `errors`: average and maximum error as fractions of the diagonal; evaluations of the surface per
+    foot, and change of a foot's parameters since the iteration before, both on average. Rows of `counts`:
+    points that took part, and control points along u and v.
 
     Examples
     --------
@@ -37,7 +37,7 @@ class ErrorHistory(eqx.Module):
 
     @staticmethod
     def empty(max_steps: int, dtype: Any) -> "ErrorHistory":
-        """With room for all iterations, or for the last MOST_ENTRIES."""
+        """A history with room for all iterations, or for the last MOST_ENTRIES."""
         entries = min(bucket(max_steps + 1, LEAST_ENTRIES), MOST_ENTRIES)
         nothing, none = np.full((4, entries), np.nan, dtype), np.zeros((3, entries), np.int32)
         return ErrorHistory(nothing, none, np.asarray(np.nan, dtype))
@@ -48,7 +48,7 @@ class ErrorHistory(eqx.Module):
         return self.errors.shape[1]
 
     def append(self, step: Array, errors: Any, counts: Any = None) -> "ErrorHistory":
-        """With the entry of iteration `step`; `counts` stay as they are if not given."""
+        """The history with the entry of iteration `step`; without `counts` the last ones are repeated."""
         entry = jnp.stack([jnp.asarray(x, self.errors.dtype) for x in errors])
         at = step % self.capacity
         first = jnp.where(step == 0, entry[0], self.first)
@@ -65,36 +65,37 @@ class ErrorHistory(eqx.Module):
         return self.at(step)[0] > self.at(jnp.maximum(step - 1, 0))[0]
 
     def is_stalled(self, step: Array, window: int, gain: Any, since: int = 0) -> Array:
-        """Whether neither error has fallen by the share `gain` within `window` iterations, those before
-        `since` not counting.
+        """Whether neither error has fallen by the share `gain` within `window` iterations.
+
+        Iterations before `since` do not count.
         """
         now, before = self.at(step)[:2], self.at(jnp.maximum(step - window, 0))[:2]
         return jnp.all(now > (1.0 - gain) * before) & (step >= window + since)
 
 
 class History(eqx.Module):
-    """What happened in every iteration, the first surface included.
+    """Errors and counts of every iteration, the first surface included.
 
     Attributes
     ----------
     average, maximum : array (steps,)
-        Errors as fractions of the diagonal: at closest points, or at fixed parameters while a method holds
-        them.
+        Errors as fractions of the diagonal, at local feet, or at the parameters while a method holds these.
+        Predicted ones where a method has `single_step`.
     evaluations : array (steps,)
-        Evaluations of the surface for a foot, on average over the points.
+        Evaluations of the surface per foot, averaged over the points.
     change : array (steps,)
-        Change of a foot's parameters (u plus v) since the iteration before, likewise.
+        Change of a foot's parameters (u plus v) since the iteration before, averaged over the points.
     active : array (steps,) of int
         Points that took part.
     net : array (steps, 2) of int
         Control points along u and v.
     faired, refined : array (steps,) of bool
-        Whether fairing, or new knots, have just changed the surface.
+        Whether fairing or new knots changed the surface in this iteration.
 
     Notes
     -----
-    The last 65,536 iterations are kept. Inside a transformation, where the number of iterations is not known,
-    the arrays have room for more, and end in NaN.
+    The last 65,536 iterations are kept. Inside a transformation the number of iterations is not known: the
+    arrays have room for more and end in NaN.
 
     Examples
     --------
@@ -115,7 +116,7 @@ class History(eqx.Module):
 
 
 def public_history(history: ErrorHistory, last_step: Any, fairing: Any = None) -> History:
-    """The recorded iterations, cut to those made where that number is known."""
+    """The history for users, cut to the iterations made where their number is known."""
     concrete = is_concrete(history, last_step)
     xp: Any = np if concrete else jnp  # cut by NumPy: by JAX, every new length would be a new compilation
     errors, counts = xp.asarray(history.errors), xp.asarray(history.counts)
@@ -138,5 +139,5 @@ def _device(parts: list[Any]) -> History:
 
 
 def without_counts(history: History) -> History:
-    """The errors alone, as fits of grids report them."""
+    """The history without counts, as fits of grids report it."""
     return dataclasses.replace(history, active=None, net=None, faired=None, refined=None)

@@ -1,7 +1,7 @@
-"""The loop of every iterative fit, written once.
+"""The loop of every iterative fit: measure, accept, record, decide, move.
 
-It measures, records, decides, and moves; it ends on a surface that has been measured exactly. Of methods it
-knows the contract `AbstractIterativeMethod` and nothing else.
+It ends on a surface that has been measured exactly. It calls methods through the contract
+`AbstractIterativeMethod` only.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ Progress = Callable[[int, int, float, float], None]
 
 
 class LoopState(eqx.Module):
-    """What goes round the loop: `current` has been measured, `next` has not."""
+    """The state of the loop: `current` has been measured, `next` has not."""
 
     current: Iterate
     next: Iterate
@@ -43,7 +43,7 @@ class LoopState(eqx.Module):
 def begin(
     method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, u: Any, v: Any, max_steps: int
 ) -> LoopState:
-    """Before anything is measured; the history has room for `max_steps` moves."""
+    """The state before the first measurement; the history has room for `max_steps` moves."""
     xp: Any = np if is_concrete(surface, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros(u.shape, np.int32)
     nothing = xp.zeros((), np.int32)
@@ -57,7 +57,7 @@ def begin(
 def run(
     method: AbstractIterativeMethod, problem: Problem, loop: LoopState, progress: Progress | None
 ) -> tuple[LoopState, dict[str, Any]]:
-    """The whole loop, in one go, or in chunks that take about REPORT_SECONDS with a report after each."""
+    """The whole loop at once, or with `progress` in chunks of about REPORT_SECONDS."""
     numbers, rest = dynamic_fields(method)
     numbers = jax.tree.map(lambda x: np.asarray(x, problem.target.dtype) if is_concrete(x) else x, numbers)
     inputs = (numbers, problem, loop)
@@ -88,8 +88,8 @@ def _advance(
 ) -> tuple[LoopState, dict[str, Any]]:
     """Iterate up to step `until`, or to the end, and postprocess.
 
-    On a CPU a batch goes through one fit after the other: there is nothing to gain from doing the same steps
-    at once, and under `vmap` every branch would be taken.
+    On a CPU a batch is fitted one after the other (`sequential_vmap`). An ordinary `vmap` would take every
+    branch, and would gain nothing from doing the same steps at once.
     """
     whole = partial(_iterate, rest)
     if jax.default_backend() == "cpu":
@@ -113,7 +113,7 @@ def _iterate(
 
 
 def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> LoopState:
-    """Measure, accept, record, judge, move."""
+    """Measure, accept, record, decide, move."""
     running, diverged = code_of(RESULTS.running), code_of(RESULTS.diverged)
     old, new = loop.current, loop.next
     projection, state = method.measure(problem, new, loop.exact)
@@ -122,7 +122,7 @@ def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: Loop
     counts = jnp.concatenate([new.projection.active[None], jnp.asarray(new.surface.used)])
     errors = problem.summarise(new.projection, old.projection)
     history = loop.history.append(new.step, errors, counts)
-    code = _judge(method, problem, new, history)
+    code = _decide(method, problem, new, history)
     again = (code != running) & (code != diverged) & ~new.projection.exact
     code = jnp.where(again, running, code)
     following, history = lax.cond(
@@ -136,10 +136,10 @@ def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: Loop
     return lax.cond((code == diverged) & (new.step > 0), lambda: kept, lambda: good)
 
 
-def _judge(
+def _decide(
     method: AbstractIterativeMethod, problem: Problem, iterate: Iterate, history: ErrorHistory
 ) -> Int[Array, ""]:
-    """Whether a surface that has just been measured ends the loop, as the code of one of RESULTS."""
+    """Whether the loop ends on a surface that has just been measured, as the code of one of RESULTS."""
     step, goal = iterate.step, problem.tolerances
     average, maximum = history.at(step)[0], history.at(step)[1]
     finite = jnp.isfinite(average + maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
@@ -159,10 +159,10 @@ def _judge(
 
 @jax.custom_jvp
 def without_derivative(inputs: Any) -> Any:
-    """The same; differentiating through it raises.
+    """The inputs; differentiating through this function raises.
 
-    The derivative of the iteration as run is not that of the fit: feet that start converged never move, so
-    their tangents would silently be zero.
+    The derivative of the iteration is not that of the fit: feet that start converged never move, so their
+    tangents would be zero.
     """
     return inputs
 

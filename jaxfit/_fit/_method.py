@@ -1,4 +1,4 @@
-"""What an iterative method is: its own state, and five functions that the loop calls."""
+"""`AbstractIterativeMethod`, the contract between the loop and a method, and `Iterate`."""
 
 from abc import abstractmethod
 from typing import Any
@@ -18,9 +18,9 @@ from jaxfit._fit._working_surface import WorkingSurface
 
 
 class Iterate(eqx.Module):
-    """A surface, the points projected onto it, the method's state, and how many moves led there.
+    """A surface, the projection of the points onto it, the method's state, and the number of moves so far.
 
-    Before it is measured, `projection` is that of the iterate before.
+    Until the surface has been measured, `projection` is that of the last iterate.
 
     Examples
     --------
@@ -40,10 +40,10 @@ class Iterate(eqx.Module):
 
 
 class AbstractIterativeMethod(eqx.Module):
-    """A method that improves a surface step by step.
+    """A method that improves a surface step by step. Subclass it to write one of your own.
 
-    The loop measures a surface, asks the method whether it keeps it, records the errors, decides whether the
-    fit ends there, and if not has the method move it:
+    The loop measures a surface, asks the method whether it accepts it, records the errors and decides whether
+    the fit ends. If not, the method moves the surface:
 
         surface, state = init(problem, surface, projection)
         repeat:  projection, state = measure(problem, iterate, exact)
@@ -51,10 +51,10 @@ class AbstractIterativeMethod(eqx.Module):
                  iterate, history = move(problem, iterate, history)
         iterate, stats = postprocess(problem, iterate, stopped_early)
 
-    The state is any pytree of arrays, whose structure and shapes do not change; only the method knows it.
-    Everything is in the unit of the problem. `init` may look at values outside transformations; the other
-    functions are traced. Python floats among the fields are traced numbers inside them, so that another value
-    compiles nothing; all other fields are known before tracing.
+    The state is any pytree of arrays whose structure and shapes do not change; the loop does not use it. All
+    lengths are in the unit of the problem. `init` sees concrete values outside transformations; the other
+    functions are traced. Fields that are Python floats are traced, so that another value compiles nothing;
+    all other fields are static.
 
     Attributes
     ----------
@@ -83,41 +83,42 @@ class AbstractIterativeMethod(eqx.Module):
     @property
     @abstractmethod
     def finds_feet(self) -> bool:
-        """Whether `measure` finds foot points; otherwise it holds the parameters that it is given."""
+        """Whether `measure` finds foot points. If not, it keeps the parameters that it is given."""
 
     @abstractmethod
     def init(
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, Any]:
-        """The surface to begin with, with room for knots if the method inserts any, and the state before
-        anything is measured; of `projection` only u and v are known.
+        """The first surface, with room for knots if the method inserts any, and the first state.
+
+        Of `projection` only u and v are known.
         """
 
     @abstractmethod
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, Any]:
-        """The points projected onto the iterate's surface, and the next state.
+        """The projection of the points onto the iterate's surface, and the next state.
 
-        Where `exact`, feet must have converged; elsewhere errors may be predictions.
+        Where `exact`, feet must have converged; otherwise errors may be predictions.
         """
 
     @abstractmethod
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new iterate, or the old one if that was better; with `new.step` either way.
+        """The new iterate, or the old one if that was better; with `new.step` in both cases.
 
-        Not asked for the first surface.
+        Not called for the first surface.
         """
 
     @abstractmethod
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
-        """The next iterate, one step or more on; several steps record their errors themselves."""
+        """The next iterate. A method that makes several steps in one move records their errors itself."""
 
     @abstractmethod
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
-        """The iterate to return, and what the method reports in the fit's `stats`.
+        """The iterate to return, and the method's entries of the fit's `stats`.
 
-        `stopped_early`: it stalled or diverged, so that an iterate of some steps ago may be the better one.
+        `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate may be better.
         """
 
 
@@ -127,7 +128,7 @@ def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
 
 
 def check_method(method: Any) -> None:
-    """The fields that methods have in common."""
+    """Raise unless the fields that methods have in common are valid."""
     check_number("stall_window", method.stall_window, 1, whole=True)
     check_number("stall_gain", method.stall_gain, 0.0)
     check_number("foot_tolerance", method.foot_tolerance, 0.0)

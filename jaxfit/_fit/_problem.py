@@ -1,4 +1,4 @@
-"""A fitting problem in its own unit: points, weights, tolerances, padded to a common size."""
+"""`Problem`: points, weights and tolerances in a unit of their own, padded to a common size."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from jaxfit._precision import bucket, working_dtype
 
 
 class Tolerances(eqx.Module):
-    """When a fit has converged or gives up. Errors are fractions of the diagonal."""
+    """The limits of a fit. Errors are fractions of the diagonal."""
 
     average: Float[Any, ""]
     maximum: Float[Any, ""]
@@ -23,18 +23,18 @@ class Tolerances(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """What is fitted. Lengths are in the unit of the problem, in which the diagonal is about 1.
+    """The points to fit. Lengths are in the unit of the problem, in which the diagonal is about 1.
 
     Attributes
     ----------
     target : array (d, points)
         The points, one coordinate after the other.
     weight : array (points,)
-        How much each counts, 0 for padding. Points of weight 0 have errors, and no influence on anything.
+        0 for padding. Points of weight 0 have errors but no influence.
     real : array (points,) of bool
-        False for what only fills up the size.
+        False for padding.
     diagonal : array ()
-        Of the bounding box of the points that count.
+        Of the bounding box of the points of positive weight.
     scale : array ()
         The unit of the problem, in the user's unit.
     tolerances : Tolerances
@@ -56,18 +56,19 @@ class Problem(eqx.Module):
 
     @property
     def counted(self) -> Bool[Array, " points"]:
-        """Which points have influence."""
+        """Points of positive weight."""
         return jnp.asarray(self.weight) > 0
 
     def ordered(self, order: Any) -> "Problem":
-        """The same with its points in another order, or some of them."""
+        """The problem with its points indexed by `order`."""
         xp: Any = np if is_concrete(self, order) else jnp
         parts = [xp.asarray(x)[..., order] for x in (self.target, self.weight, self.real)]
         return eqx.tree_at(lambda p: [p.target, p.weight, p.real], self, parts)
 
     def summarise(self, projection: Projection, before: Projection) -> Float[Array, "4"]:
-        """Of the points that count: average and maximum error as fractions of the diagonal, then averages of
-        the evaluations for a foot and of the change of its parameters.
+        """Average and maximum error as fractions of the diagonal, and the average evaluations and changes.
+
+        The last two are per foot: evaluations of the surface, and change of the parameters u plus v.
         """
         change = jnp.abs(projection.u - before.u) + jnp.abs(projection.v - before.v)
         evaluations = projection.evaluations.astype(change.dtype)
@@ -80,7 +81,7 @@ class Problem(eqx.Module):
 def make_problem(
     points: Any, weights: Any, unit: Unit, tolerances: Tolerances, padded: bool = True
 ) -> Problem:
-    """Points in the problem's unit, `padded` to their bucket where they are concrete."""
+    """The problem of `points`, `padded` to their bucket where they are concrete."""
     count, dtype = points.shape[0], working_dtype()
     concrete = is_concrete(points, weights)
     size = bucket(count) if concrete and padded else count

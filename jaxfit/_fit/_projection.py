@@ -1,4 +1,4 @@
-"""Points projected onto a surface: their feet, and how far away these are."""
+"""`Projection`: the feet of all points on a surface, and the errors there."""
 
 from typing import Any
 
@@ -20,9 +20,9 @@ class Projection(eqx.Module):
     converged : array (points,) of bool
         Whether the foot was found to the tolerance.
     active : array () of int
-        How many points took part in what the method does next.
+        The number of points that influence the next move.
     exact : array () of bool
-        False where errors are predictions. The loop measures once more, exactly, before it stops.
+        False where errors are predictions. Before it stops the loop measures once more, exactly.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""How a fit can end: an enumeration whose values are the sentences that users read."""
+"""`RESULTS`: the reasons for which a fit stops, each with its sentence."""
 
 from typing import Any
 

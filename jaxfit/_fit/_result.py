@@ -1,4 +1,4 @@
-"""What every fit returns."""
+"""`Fit`, the result of every fit."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ class Name(str):
 
 
 class Fit(eqx.Module):
-    """A fitted surface, and an honest account of how well it fits.
+    """A fitted surface, its errors, and the reason for which the fit stopped.
 
     Attributes
     ----------
@@ -29,21 +29,21 @@ class Fit(eqx.Module):
     u, v : array (points,), or (n, m) for a grid
         Parameters of the foot point of every data point.
     errors : array (points,), or (n, m) for a grid
-        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. Those of an
-        interpolation include what rounding the control points may add, but not the rounding of evaluating
-        the surface, which far from the origin is about as much again.
+        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. Errors of an
+        interpolation include a bound on the rounding of the control points. They do not include the rounding
+        of evaluating the surface, which is about as large far from the origin.
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
         Errors, evaluations and parameter changes of every iteration.
     result : item of RESULTS
-        Why the fit stopped; `converged` and `message` say it as a boolean and as a sentence.
+        Why the fit stopped; `converged` and `message` give it as a boolean and as a sentence.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
         foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
         interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
-        Other entries stand with the methods that add them.
+        Methods add further entries, which their docstrings describe.
 
     Examples
     --------
@@ -78,7 +78,7 @@ class Fit(eqx.Module):
 
     @property
     def message(self) -> str:
-        """Why the fit stopped, in a sentence, and what errors mean where that is not plain."""
+        """Why the fit stopped, and for a symmetrised grid what the errors refer to."""
         sentences: Any = RESULTS
         moved = 0.5 * self.stats.get("asymmetry", 0.0)
         if is_concrete(moved) and np.ndim(moved) == 0 and moved > self.stats.get("tolerance", np.inf):

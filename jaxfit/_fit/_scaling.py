@@ -1,4 +1,4 @@
-"""The unit that a fit works in: centred, the diagonal near 1, and the way back."""
+"""`Unit`: the change of unit after which the data is centred and its diagonal is about 1."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ class Unit(eqx.Module):
     diagonal: Any  # of the data's bounding box, in the user's unit
 
     def inward(self, x: Any) -> Any:
-        """Into the problem's unit. Concrete data is centred in double precision whatever the session's."""
+        """Into the problem's unit. Concrete data is always centred in double precision."""
         if is_concrete(x, self.centre):
             return (np.asarray(x, np.float64) - self.centre) / self.scale
         return (x - _like(self.centre, x)) / self.scale
@@ -31,7 +31,7 @@ class Unit(eqx.Module):
         return self.within(x.dtype)(x)
 
     def within(self, dtype: Any) -> "Outward":
-        """The way out for compiled code in `dtype`, though the session may have no double precision."""
+        """The inverse for compiled code in `dtype`, accurate without double precision."""
         if not is_concrete(self.centre):
             one = jnp.ones((), dtype)
             return Outward((self.scale, one), self.centre.astype(dtype), jnp.zeros_like(self.centre, dtype))
@@ -41,22 +41,23 @@ class Unit(eqx.Module):
         return Outward(factors, high, np.asarray(self.centre - high, dtype))
 
     def loss(self, points: Any) -> Any:
-        """At most how far rounding has moved `points`, a net (nu, nv, d) in the user's unit, as a fraction of
-        the diagonal: by so much errors on a surface with these control points may be larger.
+        """A bound on the rounding of a net (nu, nv, d) in the user's unit, as a fraction of the diagonal.
+
+        Errors of a surface with these control points may be larger by so much.
         """
         xp: Any = np if is_concrete(points) else jnp
         reach = xp.maximum(xp.max(points), -xp.min(points))
         return rounding_loss(points, reach / self.diagonal)
 
     def least_tolerance(self, dtype: Any) -> Any:
-        """About what rounding to `dtype` far from the origin costs, as a fraction of the diagonal."""
+        """The error of rounding to `dtype`, as a fraction of the diagonal: large far from the origin."""
         xp: Any = np if is_concrete(self.centre, self.diagonal) else jnp
         reach = xp.max(xp.abs(self.centre)) + self.diagonal
         return 8.0 * np.finfo(dtype).eps * reach / self.diagonal
 
 
 def rounding_loss(net: Any, reach: Any) -> Any:
-    """What rounding costs a net (nu, nv, d) whose largest coordinate is `reach`, in diagonals."""
+    """A bound on the rounding of a net (nu, nv, d) whose largest coordinate is `reach` diagonals."""
     share = 0.5 * np.finfo(net.dtype).eps * float(np.sqrt(net.shape[2]))
     return (share * reach).astype(net.dtype)
 
@@ -64,8 +65,8 @@ def rounding_loss(net: Any, reach: Any) -> Any:
 class Outward(eqx.Module):
     """The change of unit back to the user's, in one precision.
 
-    The scale is a product of two numbers, for it may be beyond the range of this precision where the data is
-    not. The centre is a sum of two: with the smaller added first, the sum is rounded but once.
+    The scale is a product of two numbers, since it may exceed the range of this precision. The centre is a
+    sum of two, and the smaller is added first, so that the result is rounded once.
     """
 
     factors: tuple[Float[Any, ""], Float[Any, ""]]

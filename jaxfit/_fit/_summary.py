@@ -1,4 +1,4 @@
-"""What a fit says of itself when it is printed."""
+"""The text of a printed fit."""
 
 from typing import TYPE_CHECKING, Any
 

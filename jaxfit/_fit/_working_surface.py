@@ -1,4 +1,4 @@
-"""The surface that a fit moves: control points, and knots with all that follows from them."""
+"""`WorkingSurface`: the surface that a fit moves, with its knots prepared for evaluation."""
 
 import dataclasses
 from typing import Any
@@ -16,8 +16,8 @@ from jaxfit._splines._pieces import Axis, Pieces, make_axis, pieces_on
 class WorkingSurface(eqx.Module):
     """Control points and knots in the unit of the problem, and both directions of the knots prepared.
 
-    A surface that gets more knots on the way has room for them: surplus control points behind the last one in
-    use, and as many repeats of the last knot. Neither has any influence.
+    A surface that gets more knots during the fit has room for them: surplus control points after the last one
+    in use, and as many repeats of the last knot. Neither has any influence.
 
     Examples
     --------
@@ -35,7 +35,7 @@ class WorkingSurface(eqx.Module):
 
     @staticmethod
     def of(control_points: Any, knots_u: Any, knots_v: Any, simple: bool = False) -> "WorkingSurface":
-        """With both axes made; `simple` says that no interior knot repeats (see `make_axis`)."""
+        """Prepare both axes; `simple` says that no interior knot repeats (see `make_axis`)."""
         nu, nv = control_points.shape[:2]
         axis_u = make_axis(knots_u, knots_u.shape[0] - nu, simple)
         axis_v = make_axis(knots_v, knots_v.shape[0] - nv, simple)
@@ -64,7 +64,7 @@ class WorkingSurface(eqx.Module):
         return xp.stack([xp.asarray(axis.used, np.int32) for axis in self.axes])
 
     def moved_to(self, control_points: Float[Any, "nu nv d"]) -> "WorkingSurface":
-        """The same knots with other control points."""
+        """The surface with other control points and the same knots."""
         return dataclasses.replace(self, control_points=control_points)
 
     def padded(self, room: int) -> "WorkingSurface":
@@ -89,5 +89,5 @@ class WorkingSurface(eqx.Module):
         return WorkingSurface.of(net[:nu, :nv], knots_u[: nu + order_u], knots_v[: nv + order_v])
 
     def on_device(self) -> "WorkingSurface":
-        """The same, as JAX arrays."""
+        """The surface as JAX arrays."""
         return jax.tree.map(jnp.asarray, self)

@@ -1,15 +1,15 @@
-"""What the derivative of an iterative interpolation means."""
+"""`UnrolledAdjoint` and `ImplicitAdjoint`: derivatives of an iterative interpolation."""
 
 from abc import abstractmethod
 
 import equinox as eqx
 
-# Moves after which feet that are never held count as settled.
-SETTLED_AFTER = 200
+# Moves after which feet that are never held count as converged.
+CONVERGED_AFTER = 200
 
 
 class AbstractAdjoint(eqx.Module):
-    """How parameters of feet follow the data."""
+    """How the parameters of feet depend on the data."""
 
     @abstractmethod
     def moves(self, freeze_after: int | None) -> int | None:
@@ -45,7 +45,7 @@ class UnrolledAdjoint(AbstractAdjoint):
         """As told, or as many as move feet."""
         if self.moves_followed is not None:
             return self.moves_followed
-        return SETTLED_AFTER if freeze_after is None else freeze_after
+        return CONVERGED_AFTER if freeze_after is None else freeze_after
 
 
 class ImplicitAdjoint(AbstractAdjoint):

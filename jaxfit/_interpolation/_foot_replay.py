@@ -1,7 +1,7 @@
-r"""The derivative of geometric interpolation in its data.
+r"""The derivative of geometric interpolation in its data: the moves of the feet replayed, linearised.
 
-What the loop finds satisfies $N(\hat u, \hat v) P = Q$. Its derivative needs to know how the feet follow the
-data. They moved in the first few iterations only; a derivative replays these, linearised. At a foot
+The fit satisfies $N(\hat u, \hat v) P = Q$. Its derivative needs the derivative of the feet in the data. The
+feet moved in the first few iterations only, and these are replayed. At a foot
 $g = (e \cdot R_u, e \cdot R_v) = 0$, so that $d(u, v) = H^{-1} dg$, $dg$ being taken at held parameters; the
 error vectors then change by $de = dQ - dR - R_u du - R_v dv$, and the net by $d(w e)$.
 """
@@ -24,15 +24,15 @@ from jaxfit._interpolation._repositioning import lowest_eigenvalue
 from jaxfit._interpolation._solution_derivative import with_derivative
 from jaxfit._splines._pieces import Axis, make_axis
 
-NOISE = 1e3  # rounding units of the diagonal: a point so close counts as met
-SHORT = 8  # moves: as many are remembered whole rather than made twice
+NOISE = 1e3  # rounding units of the diagonal: the error of a point so close counts as 0
+SHORT = 8  # moves: up to so many are stored rather than computed twice
 RESTART = 20  # of GMRES; the system is well conditioned wherever the iteration converges
 
 Pair = tuple[Any, Any]
 
 
 class FitInputs(eqx.Module):
-    """What a fit starts from, in the problem's unit."""
+    """The inputs of a fit, in the problem's unit."""
 
     data: Float[Any, "nu nv d"]
     knots: Pair
@@ -44,7 +44,7 @@ class FitInputs(eqx.Module):
 
 
 class Fitted(eqx.Module):
-    """What a fit ends with."""
+    """The net and the feet of a finished fit."""
 
     net: Float[Array, "nu nv d"]
     u: Float[Array, "nu nv"]
@@ -61,7 +61,7 @@ def attach_derivative(
 ) -> Fitted:
     """`fitted`, with the derivative in `inputs` that the method's adjoint asks for.
 
-    `path` holds the feet before each of the first moves, or nothing where they are not followed.
+    `path` holds the feet before each of the first moves, or nothing where they have no derivative.
     """
     return fitted
 
@@ -81,7 +81,7 @@ def _replayed(method: Any, order: tuple[int, int], fitted: Fitted, path: Array, 
     axes = make_axis(knots[0], order[0], simple=True), make_axis(knots[1], order[1], simple=True)
     if path.shape[0]:
         feet = _feet_along(lax.stop_gradient(path), method, axes, inputs)
-        # The values are those of the fit, which may have looked for its feet again at the end.
+        # The values are those of the fit, which may have searched its feet again at the end.
         u, v = (x + (y - lax.stop_gradient(y)) for x, y in zip((u, v), feet, strict=True))
     net = with_derivative(RESTART, fitted.net, (u, v), axes, None, inputs.data)
     return Fitted(net, u, v)

@@ -1,4 +1,4 @@
-"""Geometric interpolation of grids: section 3 of the paper."""
+"""`GeometricInterpolation`: section 3 of the paper."""
 
 from typing import Any
 
@@ -85,7 +85,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     foot_tolerance : float
         To what tangential error, as a fraction of the diagonal.
     keep_borders : bool, default False
-        Whether feet of the grid's border points are looked for on the border curves only. Otherwise they are
+        Whether feet of the grid's border points are searched on the border curves only. Otherwise they are
         closest points of the whole surface, as in the paper, and may leave the border a little.
     per_point : bool, default False
         Whether feet start at each point's own parameters in its row and column, as in the paper, rather
@@ -164,12 +164,12 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
 
     @property
     def stall_since(self) -> int:
-        """From the first iteration on."""
+        """The first iteration."""
         return 0
 
     @property
     def finds_feet(self) -> bool:
-        """Always."""
+        """True: feet are found in every iteration."""
         return True
 
     def init(
@@ -206,7 +206,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         return here, GeometricState(best[0], best[1], least, path, state.lowest)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new one: errors may rise on the way."""
+        """The new iterate: errors may rise on the way."""
         return new
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:

@@ -1,4 +1,4 @@
-"""Interpolation of grids whose points have unit normals: tensor-product Hermite interpolation."""
+"""`NormalInterpolation`: tensor-product Hermite interpolation of points and unit normals."""
 
 from typing import Any
 

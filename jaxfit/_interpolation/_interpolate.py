@@ -1,4 +1,4 @@
-"""The verb for grids: a surface through all of them."""
+"""`interpolate`: a surface through all points of a grid."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What an interpolation method is: given a grid in the problem's unit, it returns a fit."""
+"""The contract of interpolation methods: a method returns a fit to a grid in the problem's unit."""
 
 import dataclasses
 from abc import abstractmethod

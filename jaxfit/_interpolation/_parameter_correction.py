@@ -1,4 +1,4 @@
-"""Solving the collocation system of a grid with a parameter pair for every point, and correcting these."""
+"""The collocation system with a parameter pair for every point, and parameter correction."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaxfit._splines._pieces import Axis, pieces_on
 
 
 class CollocationProblem(eqx.Module):
-    """The data, and what all solves share."""
+    """The data, knots and preconditioner of the system."""
 
     data: Float[Array, "n m d"]
     knots: tuple[Array, Array]
@@ -80,8 +80,10 @@ def solved_at(
 
 
 def corrected(method: Any, problem: CollocationProblem, found: Corrected) -> Corrected:
-    """Closest points and a new solve in turn, until the parameters rest, or neither they nor the errors
-    come down any more."""
+    """Alternates closest points and a new solve.
+
+    Stops when the parameters no longer change, or when neither their change nor the errors fall.
+    """
     n, m, d = problem.data.shape
     limits = problem.limits
     target = problem.data.reshape(n * m, d).T

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._splines._pieces import Axis
 
-UNROLL = 16  # terms of a sum in one turn of a loop
+UNROLL = 16  # terms of a sum in one iteration of a loop
 
 
 class PointCollocation(eqx.Module):

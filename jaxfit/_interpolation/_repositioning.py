@@ -1,4 +1,4 @@
-"""How far a control point follows the error vector of its data point: weights of geometric interpolation."""
+"""The weights of geometric interpolation: the share of its error vector by which a control point moves."""
 
 from abc import abstractmethod
 from typing import Any, ClassVar
@@ -107,9 +107,9 @@ def _lowest(axis: Axis, u: Array) -> Float[Array, ""]:
     # Close to the eigenvector, which changes sign at every step.
     start = jnp.where(columns % 2 == 0, 1.0, -0.9).astype(u.dtype)
 
-    def turn(_: Any, x: Array) -> Array:
+    def power_step(_: Any, x: Array) -> Array:
         y = jnp.matmul(rest, x, precision="highest")
         return y / jnp.linalg.norm(y)
 
-    x = lax.fori_loop(0, POWER_ITERATIONS, turn, start / jnp.linalg.norm(start))
+    x = lax.fori_loop(0, POWER_ITERATIONS, power_step, start / jnp.linalg.norm(start))
     return 1.0 - jnp.linalg.norm(jnp.matmul(rest, x, precision="highest"))

@@ -1,4 +1,4 @@
-"""Standard interpolation of grids: the collocation system of sections 2.2 and 3 of the paper."""
+"""`StandardInterpolation`: the collocation system of sections 2.2 and 3 of the paper."""
 
 from typing import Any
 
@@ -42,7 +42,7 @@ class StandardInterpolation(AbstractDirectInterpolation):
         sparse system is solved by GMRES, preconditioned by the tensor product.
     parameter_correction : bool, default False
         Whether to replace the parameters by those of the closest points and to solve again, until they no
-        longer move or, where they do not settle, the errors stop falling.
+        longer move or, where they do not converge, the errors stop falling.
     max_corrections : int, default 10
         Most corrections.
     foot_tolerance : float, default 1e-13

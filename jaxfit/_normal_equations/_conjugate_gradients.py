@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on nets: the one iteration of all solvers that are not direct."""
+"""Preconditioned conjugate gradients on nets, for all solvers that are not direct."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 Operator = Callable[[Array], Array]
-Carry = tuple[Array, Array, Array, Array, Array]
+State = tuple[Array, Array, Array, Array, Array]
 
 
 class Solution(NamedTuple):
@@ -31,20 +31,20 @@ def conjugate_gradients(
     """Solves a positive semidefinite system from 0.
 
     Stops where the residual, in the norm of the preconditioner, is `rtol` times the right-hand side, after
-    `max_steps` iterations, or where the matrix has no curvature. Stopped anywhere the solution is a direction
-    of descent: the quadratic model falls from one iteration to the next. Unless the channels are `coupled`
-    each has a step length of its own.
+    `max_steps` iterations, or where the matrix has no curvature. The quadratic model falls in every
+    iteration, so any intermediate solution is a direction of descent. Unless the channels are `coupled`, each
+    has its own step length.
     """
 
     def inner(x: Array, y: Array) -> Array:
         return jnp.sum(x * y, axis=None if coupled else (0, 1), keepdims=True)
 
-    def unfinished(carry: Carry) -> Array:
-        _, _, _, slope, steps = carry
+    def unfinished(state: State) -> Array:
+        _, _, _, slope, steps = state
         return jnp.any(slope > goal) & (steps < max_steps)
 
-    def step(carry: Carry) -> Carry:
-        net, left, along, slope, steps = carry
+    def step(state: State) -> State:
+        net, left, along, slope, steps = state
         image = matrix(along)
         length = _ratio(slope, inner(along, image))
         net, left = net + length * along, left - length * image

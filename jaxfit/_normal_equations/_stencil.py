@@ -69,13 +69,13 @@ def shifted_products(
     stored = (number, abs(shift_u), abs(shift_v), np.minimum(a, reach_u), np.minimum(b, reach_v))
     zero = np.int32(0)
 
-    def cut(array: Array, start: tuple[Any, ...], size: tuple[int, ...]) -> Array:
+    def part_of(array: Array, start: tuple[Any, ...], size: tuple[int, ...]) -> Array:
         return lax.dynamic_slice(array, start, size, allow_negative_indices=False)
 
     def add(total: Array, at: Any) -> tuple[Array, None]:
         place, a, b = at
-        entry = cut(entries, (zero, *place), (p, 1, 1, 1, nu, nv))
-        neighbour = cut(wide, (place[0], zero, a, b), (1, x.shape[1], nu, nv))
+        entry = part_of(entries, (zero, *place), (p, 1, 1, 1, nu, nv))
+        neighbour = part_of(wide, (place[0], zero, a, b), (1, x.shape[1], nu, nv))
         return total + lax.squeeze(entry, (1, 2, 3)) * lax.squeeze(neighbour, (0,)), None
 
     none = jnp.zeros((max(p, x.shape[1]), nu, nv), jnp.result_type(entries, x))

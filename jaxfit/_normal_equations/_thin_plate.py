@@ -56,8 +56,8 @@ class ThinPlate(eqx.Module):
     def energy(self, net: Float[Array, "nu nv c"]) -> Float[Array, ""]:
         """F_s itself.
 
-        As a sum of squares it is right to rounding. The product P . A P would lose as many digits as the
-        greatest eigenvalue of A exceeds what bends the net: six of a smooth surface of 60 x 60.
+        As a sum of squares it is accurate to rounding. The product P . A P would lose digits, since the
+        greatest eigenvalue of A far exceeds the energy of a smooth net: six digits for 60 x 60 points.
         """
         return jnp.sum(self.residual(net) ** 2)
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxfit._splines._basis import spans_and_weights
 
-UNROLL = 2  # rows per turn of a loop over right-hand sides
+UNROLL = 2  # rows per iteration of a loop over right-hand sides
 
 
 def collocation_band(

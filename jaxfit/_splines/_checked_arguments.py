@@ -1,4 +1,4 @@
-"""What curves and surfaces accept: control points and knots that belong together."""
+"""Checks of control points and knots."""
 
 import operator
 from collections.abc import Sequence

@@ -35,7 +35,7 @@ class BSplineCurve(eqx.Module):
     ValueError
         If the shapes do not belong together, the order is not 2 to 8, a number is not finite,
         or the knots decrease, repeat too often or leave an empty domain. Inside `jit` values
-        cannot be looked at, and only shapes are checked.
+        are unknown, and only shapes are checked.
     TypeError
         If the numbers are not real.
 

@@ -1,4 +1,4 @@
-"""Looking things up in vectors: runs of consecutive entries, and places in sorted values."""
+"""Look-ups in vectors: runs of consecutive entries, and places in sorted values."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""A spline as polynomials, one per cell: what every fast evaluation and every fit stands on.
+"""A spline as polynomials, one per cell: the form that fast evaluation and all fits use.
 
 A *cell* is a knot-span rectangle. With K - 1 and L - 1 the degrees, the surface on a cell is
 

@@ -46,7 +46,7 @@ class BSplineSurface(eqx.Module):
     ValueError
         If the shapes do not belong together, an order is not 2 to 8, a number is not finite,
         or knots decrease, repeat too often or leave an empty domain. Inside `jit` values
-        cannot be looked at, and only shapes are checked.
+        are unknown, and only shapes are checked.
     TypeError
         If the numbers are not real.
 
@@ -233,7 +233,7 @@ class BSplineSurface(eqx.Module):
         return BSplineSurface(image, self.knots_u, self.knots_v)
 
     def transpose(self) -> "BSplineSurface":
-        """The same surface with u and v exchanged (its normals turn round)."""
+        """The same surface with u and v exchanged (its normals change sign)."""
         return BSplineSurface(jnp.swapaxes(self.control_points, 0, 1), self.knots_v, self.knots_u)
 
     def iso_u(self, u: ArrayLike, *, extrapolate: bool = False) -> BSplineCurve:
