@@ -4,7 +4,6 @@ import ast
 import subprocess
 import sys
 
-import pytest
 from helpers import CHECKOUT
 
 import jaxfit
@@ -35,23 +34,23 @@ def names_of_jaxfit(tree):
             yield node.attr
 
 
-@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)
-def test_benchmarks_take_public_names_only(path):
-    names = set(names_of_jaxfit(ast.parse(path.read_text())))
-    assert names
-    assert not [name for name in names if private(name)]
-    missing = [name for name in names if name and not hasattr(jaxfit, name.split(".")[0])]
-    assert not missing, "these are no public names of jaxfit"
+def test_benchmarks_take_public_names_only():
+    for path in PROGRAMS:
+        names = set(names_of_jaxfit(ast.parse(path.read_text())))
+        assert names, path
+        assert not [name for name in names if private(name)], path
+        missing = [name for name in names if name and not hasattr(jaxfit, name.split(".")[0])]
+        assert not missing, f"{path}: these are no public names of jaxfit"
 
 
-@pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)
-def test_benchmarks_are_programs_with_a_docstring_and_a_main(path):
-    tree = ast.parse(path.read_text())
-    assert f"python benchmarks/{path.name}" in ast.get_docstring(tree)
-    assert "main" in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
-    guard = tree.body[-1]
-    assert isinstance(guard, ast.If)
-    assert ast.unparse(guard.test) == "__name__ == '__main__'"
+def test_benchmarks_are_programs_with_a_docstring_and_a_main():
+    for path in PROGRAMS:
+        tree = ast.parse(path.read_text())
+        assert f"python benchmarks/{path.name}" in ast.get_docstring(tree)
+        assert "main" in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)], path
+        guard = tree.body[-1]
+        assert isinstance(guard, ast.If), path
+        assert ast.unparse(guard.test) == "__name__ == '__main__'"
 
 
 def test_every_benchmark_explains_its_options():

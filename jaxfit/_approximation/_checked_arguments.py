@@ -60,9 +60,9 @@ def _counted(points: Any, weight: Any) -> Any:
     if is_concrete(points, weight):
         counted = np.asarray(weight) > 0
         some = np.asarray(points)[counted]
-        # Points that all coincide give no unit.
+        # Those that all coincide give no unit.
         return points if counted.all() or not np.ptp(some, axis=0).any() else some
-    # Traced weights: points of weight 0 are replaced by one that counts.
+    # Of traced weights all points of weight 0 are taken to be where one that counts is.
     points, weight = jnp.asarray(points), jnp.asarray(weight)
     first = points[jnp.argmax(weight > 0)]
     return jnp.where((weight > 0)[:, None], points, first[None])

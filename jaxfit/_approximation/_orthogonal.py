@@ -192,7 +192,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
         gain = objective - total_cost(self.loss, length, weight, here.error) - state.energy
         feet = (before.u, before.v), (here.u, here.v)
         longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
-        good = (gain > 0) & is_plausible(state, gain, longest_move)
+        # With a traced lambda that is none no step is finite, and the loop ends.
+        lost = jnp.isnan(new.state.smoothing)
+        good = lost | ((gain > 0) & is_plausible(state, gain, longest_move))
         damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, good))
         origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
         kept = lax.cond(

@@ -56,7 +56,7 @@ def _found(
         return feet.best_u, feet.best_v, feet.converged, feet.steps
     count = target.shape[1]
     samples = sample_points(net - centre[None, None, :], pieces.axis_u, pieces.axis_v)
-    u, v = best_samples(*map(jnp.asarray, samples), target)
+    u, v = best_samples(jnp.asarray(samples[0]), jnp.asarray(samples[1]), jnp.asarray(samples[2]), target)
     twice = jnp.concatenate([target, target], axis=1)
     feet = project(method, pieces, twice, u.reshape(-1), v.reshape(-1), tolerance, max_steps)
     second = feet.best[count:] < feet.best[:count]

@@ -10,6 +10,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -219,7 +220,8 @@ class _Pass(eqx.Module):
             found &= ~mode.fixed | (before == FOUND)
             state = jnp.where(done, jnp.where(found, float(SUMMED_FOUND), float(SUMMED_GIVEN_UP)), feet.state)
             counts = done & jnp.isfinite(feet.f)
-            local = jnp.where(counts, jnp.clip(bounds.local(feet.best), -1.0, 1.0), 0.0)
+            one = np.ones((), feet.f.dtype)
+            local = jnp.where(counts, lax.clamp(-one, bounds.local(feet.best), one), 0.0)
             assert feet.e is not None
             e, weight = jnp.where(counts, feet.e, 0.0), counts.astype(feet.f.dtype)
             return state, local, e, weight if given is None else weight * given

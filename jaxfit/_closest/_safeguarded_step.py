@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -148,7 +149,8 @@ def _downhill(
 
     Cut off at a bound, a coupled step may do so; the scaled gradient never does.
     """
-    step = bounds.clip_step(x, jnp.clip(step, -LONGEST_STEP, LONGEST_STEP))
+    longest = np.asarray(LONGEST_STEP, step.dtype)
+    step = bounds.clip_step(x, lax.clamp(-longest, step, longest))
     uphill = total(forms.gradient * step) <= 0
     slope = 0.5 * forms.gradient / jnp.maximum(forms.metric, jnp.finfo(x.dtype).tiny)
     slope = bounds.clip_step(x, jnp.where(pinned, 0.0, slope))
