@@ -49,6 +49,7 @@ def ours(work, name, steps):
     begun = time.perf_counter()
     plain = jf.GeometricApproximation(relaxation=1.0, acceleration=None, single_step=False)
     options = dict(tol_average=1e-12, max_steps=steps, start=(start[:, 0], start[:, 1]))
+    options["errors"] = jf.LocalFeet()  # as the program, which searches only from the feet it has
     fit = jf.approximate(points, base, plain, **options)
     return fit, time.perf_counter() - begun, np.linalg.norm(np.ptp(points, axis=0))
 
