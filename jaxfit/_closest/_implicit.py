@@ -5,6 +5,7 @@ half the squared distance. So d(u, v) = H^-1 dg, dg being taken at fixed (u, v).
 border or on a crease does not move; where H is singular nothing moves, so that nothing is ever NaN.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -34,7 +35,10 @@ def foot_parameters(
 ) -> tuple[Array, Array, Array, Array]:
     """(u, v, converged, steps); from `start`, or from the two best of a dense sample without one."""
     fixed = lax.stop_gradient((surface, points, start, tolerance, max_steps))
-    u, v, converged, steps = _found(method, *fixed)
+    search = partial(_found, method)
+    if jax.default_backend() == "cpu":  # a batch one by one: at once, every branch would be taken for all
+        search = jax.custom_batching.sequential_vmap(search)
+    u, v, converged, steps = search(*fixed)
     u, v = as_feet((u, v), surface, points, tolerance)
     return u, v, converged, steps
 

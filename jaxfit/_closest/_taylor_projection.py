@@ -91,7 +91,9 @@ def certified_step(
     def judge(e: Array, tangents: Array, step: Array, free: Array, forms: Forms, x: Array) -> tuple:
         f, length = inner(e, e), total(jnp.abs(step))
         end = x + step * bounds.half
-        within = (end >= bounds.low) & (end <= bounds.high) & _in_cell(bounds, x) & _in_cell(bounds, end)
+        # Cut off at a bound a coupled step leads astray.
+        allowed = (end >= bounds.low) & (end <= bounds.high)
+        within = allowed & _in_cell(bounds, x) & _in_cell(bounds, end)
         slopes, sizes = inner(e, tangents), jnp.sqrt(inner(tangents, tangents))
         turned = 0.5 * third * length * length
         # The product of the true residual with a tangent is at most
@@ -105,7 +107,7 @@ def certified_step(
         nearer = f <= forms.f * (1.0 + eps) + tolerance**2
         certain = both(within & proven) & nearer
         downhill = total(step * forms.gradient) > 0
-        good = nearer & downhill & (length < LONGEST_TAYLOR_STEP)
+        good = nearer & downhill & both(allowed) & (length < LONGEST_TAYLOR_STEP)
         return Prediction(lax.clamp(bounds.low, end, bounds.high), e, f, certain), good
 
     return materialise(always, judge, e, tangents, step, free, forms, x)
