@@ -179,7 +179,7 @@ class StandardApproximation(AbstractIterativeMethod):
         surface, here, state = iterate.surface, iterate.projection, iterate.state
         system = self.system(problem, surface, here, state.smoothing, state.plate)
         net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
-        net = jnp.where(jnp.isnan(state.smoothing), jnp.nan, net)  # a traced lambda that is none
+        net = net + 0.0 * state.smoothing  # NaN for a traced lambda that is none
         surface, step = surface.moved_to(net), iterate.step + 1
         if self.insertion is not None:
             surface = self.insertion(step, surface, here, problem.counted)

@@ -92,7 +92,8 @@ def certified_step(
         f, length = inner(e, e), total(jnp.abs(step))
         end = x + step * bounds.half
         # Cut off at a bound a coupled step leads astray.
-        allowed = (end >= bounds.low) & (end <= bounds.high)
+        nearest = lax.clamp(bounds.low, end, bounds.high)
+        allowed = nearest == end
         within = allowed & _in_cell(bounds, x) & _in_cell(bounds, end)
         slopes, sizes = inner(e, tangents), jnp.sqrt(inner(tangents, tangents))
         turned = 0.5 * third * length * length
@@ -108,7 +109,7 @@ def certified_step(
         certain = both(within & proven) & nearer
         downhill = total(step * forms.gradient) > 0
         good = nearer & downhill & both(allowed) & (length < LONGEST_TAYLOR_STEP)
-        return Prediction(lax.clamp(bounds.low, end, bounds.high), e, f, certain), good
+        return Prediction(nearest, e, f, certain), good
 
     return materialise(always, judge, e, tangents, step, free, forms, x)
 

@@ -110,13 +110,13 @@ def unit_of(points: Any, name: str = "points") -> Unit:
             raise ValueError(
                 f"{name} must not all coincide, but their bounding box has no extent; give distinct points."
             )
-        check_resolution(name, low, high, diagonal)
         info = np.finfo(working_dtype())
         if diagonal < info.tiny / info.eps or max(-low.min(), high.max()) > info.max:
             raise ValueError(
                 f"{name} must keep to the range of {info.dtype} in size, but the bounding box has the "
                 f"diagonal {diagonal:.3g}; choose another unit of length."
             )
+        check_resolution(name, low, high, diagonal)
         return Unit(0.5 * (low + high), 2.0 ** round(np.log2(diagonal)), diagonal)
     low, high = jnp.min(points, axis=0), jnp.max(points, axis=0)
     diagonal = jnp.linalg.norm(high - low)
