@@ -131,8 +131,9 @@ def approximate(
     order = _order_by_cell(begun, u, v, cloud.shape[0])
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
-    loop = begin(method, problem.ordered(order), begun, u[order], v[order], max_steps)
-    loop, stats = run(method, problem.ordered(order), loop, progress if concrete else None)
+    together = problem.ordered(order)
+    loop = begin(method, together, begun, u[order], v[order], max_steps)
+    loop, stats = run(method, together, loop, progress if concrete else None)
     surface = _fitted(loop, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
     parts = _at_feet(errors, surface, cloud, known, method.finds_feet, concrete)
@@ -211,7 +212,12 @@ def _in_given_order(loop: LoopState, order: Any, count: int, unit: Unit, concret
     """The last feet, in the order of the points and in the user's unit."""
     here = loop.current.projection
     xp: Any = np if concrete else jnp
-    back = xp.argsort(order)[:count]
+    if concrete:  # the inverse of a permutation needs no sort
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        back = back[:count]
+    else:
+        back = jnp.argsort(order)[:count]
     u, v, error, converged = (xp.asarray(x)[back] for x in (here.u, here.v, here.error, here.converged))
     return u, v, error * unit.scale, converged
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxfit._cells._polynomials import PARTIALS, polynomial_partials
 from jaxfit._cells._rows import Rows, make_rows
+from jaxfit._splines._evaluate import in_blocks
 from jaxfit._splines._pieces import Pieces
 
 
@@ -54,14 +55,18 @@ def values_at(
 ) -> Float[Array, "d points"]:
     """Points on the surface, each with its own cell's polynomial.
 
-    Every coefficient is fetched where it is needed: one loop over the points, with nothing stored between.
+    Every coefficient is fetched where it is needed, for a block of points at a time.
     """
     pieces = jax.tree.map(jnp.asarray, pieces)
     d, order_u, order_v = pieces.coefficients.shape[1:]
-    cell = cells_of(pieces, u, v)
-    s, t = local_coordinates(pieces, cell, u, v)
-    terms = order_u * order_v
-    number = jnp.arange(d * terms, dtype=cell.dtype).reshape(d, terms).T[..., None]
-    flat = take(pieces.coefficients.reshape(-1), cell[None, None] * (d * terms) + number, 0)
-    each = [x[0] for x in lax.split(flat, (1,) * terms)]
-    return polynomial_partials(each, order_v, s[None], t[None], PARTIALS[:1])[0]
+    terms, coefficients = order_u * order_v, pieces.coefficients.reshape(-1)
+
+    def values(u: Array, v: Array) -> Float[Array, "points d"]:
+        cell = cells_of(pieces, u, v)
+        s, t = local_coordinates(pieces, cell, u, v)
+        number = jnp.arange(d * terms, dtype=cell.dtype).reshape(d, terms).T[..., None]
+        flat = take(coefficients, cell[None, None] * (d * terms) + number, 0)
+        each = [x[0] for x in lax.split(flat, (1,) * terms)]
+        return polynomial_partials(each, order_v, s[None], t[None], PARTIALS[:1])[0].T
+
+    return in_blocks(values, u, v).T
