@@ -119,3 +119,10 @@ def test_errors_are_measured_as_certainly_as_asked_for(base, errors):
         assert float(fit.average_error) > 1.1 * float(nearest.mean())
     if isinstance(errors, jf.GlobalFeet):
         np.testing.assert_allclose(fit.errors, nearest, atol=1e-12)
+
+
+def test_a_limit_on_the_iterations_that_is_out_of_reach_costs_no_memory(base):
+    fit = jf.approximate(POINTS, base, METHODS["geometric"], tol_average=1e-3, max_steps=10**9)
+    assert bool(fit.converged)
+    grid = np.stack(np.meshgrid(np.arange(6.0), np.arange(5.0), [0.0], indexing="ij"), -1)[:, :, 0]
+    assert bool(jf.interpolate(grid, max_steps=10**9).converged)
