@@ -67,8 +67,9 @@ class LocalFeet(AbstractErrors):
 class GlobalFeet(AbstractErrors):
     """Errors at true closest points: the whole surface is searched. The default of every method.
 
-    A bound proves that most local feet are the nearest; only the others are searched for. Inside
-    transformations a fit that ends on feet keeps its local ones.
+    In large clouds, feet well below the reach of the surface, which is estimated from samples, count as the
+    nearest; the others are searched for. Neither is a proof (see `closest_point`). Inside transformations
+    a fit that ends on feet keeps its local ones.
 
     Examples
     --------

@@ -127,6 +127,9 @@ def closest_point(
     (section 3.1 of the paper) and say so. A foot also counts as found where the last two steps predict, by
     quadratic convergence, a tangential residual below a hundredth of the tolerance, which saves one.
 
+    Of clouds with many points a cell only those are searched for whose first foot is farther than 0.3 times
+    the reach of the surface, which is estimated from samples and not proven.
+
     The global search can miss the nearest foot where samples are very uneven: next to an edge collapsed to a
     point, a few queries in ten thousand. Nor does it tell two feet apart that lie within one and a half of
     its samples (a third of a span each, or less), as on a surface that folds over so tightly. On a surface

@@ -1,4 +1,4 @@
-"""Nearest feet of concrete points: padded to common sizes, and searched for where nothing is proven."""
+"""Nearest feet of concrete points: padded to common sizes; searched for above the reach of the surface."""
 
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -41,9 +41,9 @@ def nearest_feet(
 ) -> HostFeet:
     """Feet of all points: `u`, `v`, `f` (squared distance), `converged`, `steps`, and `point` on the surface.
 
-    From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: points whose
-    foot is below the reach of the surface are done, and the others are searched for. `known` are feet (u, v,
-    distance, converged) found before, with which the search begins; `point` is then left out. `tolerance` is
+    From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
+    clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
+    for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is then left out. `tolerance` is
     a fraction of the extent. Of a net with surplus control points, behind repeated end knots, `used` says
     how many are in use along u and v.
     """
@@ -148,8 +148,8 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
     # The reach is that of a surface in space whose tangent plane nowhere jumps.
     smooth = not (axes[0].creased or axes[1].creased) and axes[1].polynomials.shape[1] > 1
     if smooth and net.shape[2] == 3 and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
-        proven = Reach(net, *axes).proves(best["u"], best["v"], np.sqrt(best["f"]))
-        left = np.flatnonzero(~(proven & best["converged"]))
+        below = Reach(net, *axes).covers(best["u"], best["v"], np.sqrt(best["f"]))
+        left = np.flatnonzero(~(below & best["converged"]))
     if left.size:
         search = search or Search(sample(net.astype(projector.dtype), *axes))
         _try_candidates(projector, search, left, best)

@@ -1,4 +1,4 @@
-"""A bound below which a foot is certain to be the nearest: the reach of the surface, sample by sample.
+"""The distance below which a foot is the nearest: the reach of the surface, estimated sample by sample.
 
 Let p be a foot of q at the distance d, and p + x another point of the surface. It is nearer to q only if
 |x|^2 < 2 (q - p).x, and q - p is normal to the surface (on a border it may point outwards too), so only if
@@ -7,7 +7,7 @@ Let p be a foot of q at the distance d, and p + x another point of the surface. 
 
 The least of these over all x is the reach at p (Federer 1959): up to it no foot is any but the nearest. It
 is taken over pairs of neighbouring samples. Farther ones are at least a radius R away, which alone gives
-R / 2.
+R / 2. What lies between samples is left to a factor of safety: this is an estimate, not a proof.
 """
 
 import os
@@ -59,8 +59,8 @@ class Reach:
         self.forms = E, F, G
         self.tree = KDTree(self.points.T, LEAF, balanced_tree=False, compact_nodes=False)
 
-    def proves(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
-        """Whether the feet at (u, v), `distance` away from their points, are certain to be the nearest."""
+    def covers(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
+        """Whether the feet at (u, v), `distance` away from their points, lie below the reach."""
         a, b = self.shape
         row, column = (
             _interval(axis, x, count - 1) for axis, x, count in zip(self.axes, (u, v), (a, b), strict=True)

@@ -18,7 +18,7 @@ _DAMAGED = (
     ValueError,
     EOFError,
     KeyError,
-    RuntimeError,  # NotImplementedError among them
+    RuntimeError,  # a compression that is not supported, for one
     tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
