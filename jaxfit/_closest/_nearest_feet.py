@@ -43,9 +43,9 @@ def nearest_feet(
 
     From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
-    for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is then left out. `tolerance` is
-    a fraction of the extent. Of a net with surplus control points, behind repeated end knots, `used` says
-    how many are in use along u and v.
+    for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
+    then left out. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
+    repeated end knots, `used` says how many are in use along u and v.
     """
     projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, known is not None)
     if start is not None:
