@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfit._checks import as_direction, check_number
+from jaxfit._compile import compiled
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._geometry import unit_normal
 
@@ -106,7 +106,7 @@ def zebra_grid(
     return _wave(normal, axis, eye, int(stripes))
 
 
-@partial(jax.jit, static_argnames="stripes")
+@partial(compiled, static_argnames="stripes")
 def _wave(
     normal: Float[Array, "*shape 3"], axis: Float[Array, "3"], eye: Float[Array, "3"], stripes: int
 ) -> Float[Array, "*shape"]:

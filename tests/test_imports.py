@@ -14,7 +14,7 @@ ROOMS = [
     ("_interrupt",),
     ("_checks",),
     ("_precision",),
-    ("_barrier",),
+    ("_barrier", "_compile"),
     ("_splines",),
     ("_parameters",),
     ("_cells",),

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -21,6 +20,7 @@ from jaxtyping import Bool, Float
 from jaxfit._approximation._least_squares import least_squares_problem
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
+from jaxfit._compile import compiled
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -208,7 +208,7 @@ def select_smoothing(
     return _select(rule, without, problem, surface, projection)
 
 
-@partial(jax.jit, static_argnames=("rule", "method"))
+@partial(compiled, static_argnames=("rule", "method"))
 def _select(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:

@@ -3,12 +3,12 @@
 from abc import abstractmethod
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile import compiled
 from jaxfit._splines import BSplineCurve, BSplineSurface, greville_abscissae
 
 
@@ -111,7 +111,7 @@ def coons_surface(
     return BSplineSurface(coons_net(controls, v0.knots, u0.knots, abscissae), v0.knots, u0.knots)
 
 
-@jax.jit
+@compiled
 def coons_net(
     controls: tuple[Array, Array, Array, Array],
     knots_u: Array,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxfit._compile import compiled
 from jaxfit._splines._basis import spans_and_weights
 from jaxfit._splines._insertion import insert_along
 
@@ -101,7 +102,7 @@ def _padded(start: CurveStart, order: int, points: int, capacity: int) -> tuple[
     )
 
 
-@partial(jax.jit, static_argnames="order")
+@partial(compiled, static_argnames="order")
 def _fit_batch(
     problem: _Problem, feet: Array, control: Array, tolerance: Array, max_steps: Array, order: int
 ) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
 from jaxfit._closest._reach import Reach
 from jaxfit._closest._samples import sample
+from jaxfit._compile import compiled
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
@@ -61,7 +62,7 @@ def nearest_feet(
     return best
 
 
-@partial(jax.jit, static_argnames=("method",))
+@partial(compiled, static_argnames=("method",))
 def _run(
     method: AbstractFootMethod,
     pieces: Pieces,

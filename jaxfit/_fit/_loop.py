@@ -16,6 +16,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Int
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile import compiled
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
 from jaxfit._fit._problem import Problem
@@ -82,7 +83,7 @@ def run(
         chunk = max(1, min(2 * chunk, int(chunk * REPORT_SECONDS / max(seconds, 1e-6))))
 
 
-@partial(jax.jit, static_argnums=0)
+@partial(compiled, static_argnums=0)
 def _advance(
     rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState
 ) -> tuple[LoopState, dict[str, Any]]:

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxfit._closest import Border
 from jaxfit._closest._implicit import foot_change
+from jaxfit._compile import compiled
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import side_bounds
 from jaxfit._interpolation._point_collocation import PointCollocation, at_cells, control_point_windows
@@ -73,7 +74,7 @@ def _attach_jvp(method: Any, order: tuple[int, int], primals: Any, tangents: Any
     return jax.jvp(partial(_replayed, method, order, fitted, path), (inputs,), tangents[2:])
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@partial(compiled, static_argnums=(0, 1))
 def _replayed(method: Any, order: tuple[int, int], fitted: Fitted, path: Array, inputs: FitInputs) -> Fitted:
     """`fitted` as a function of what the fit started from."""
     u, v, knots = fitted.u, fitted.v, inputs.knots

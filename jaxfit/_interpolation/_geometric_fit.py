@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile import compiled
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface
@@ -42,7 +43,7 @@ class Start(eqx.Module):
     extent: Array
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@partial(compiled, static_argnums=(0, 1, 2, 3))
 def started(
     parametrisation: AbstractParametrisation,
     per_point: bool,

@@ -14,6 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile import compiled
 from jaxfit._fit._history import (
     LEAST_ENTRIES,
     MOST_ENTRIES,
@@ -109,7 +110,7 @@ class AbstractDirectInterpolation(AbstractInterpolation):
         return fit
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@partial(compiled, static_argnums=(0, 1, 2))
 def _compiled(
     method: AbstractDirectInterpolation, entries: int, order: Pair, data: Any, normals: Any, frame: Frame
 ) -> tuple[Fit, Array]:

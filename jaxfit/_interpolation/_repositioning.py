@@ -4,12 +4,12 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from equinox import AbstractClassVar
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._compile import compiled
 from jaxfit._interpolation._point_collocation import PointCollocation, basis_at
 from jaxfit._splines._pieces import Axis
 
@@ -86,7 +86,7 @@ class ConstantWeight(AbstractRepositioning):
         return jnp.full_like(collocation.basis_u[0], 2.0 / (1.0 + lowest))
 
 
-@jax.jit
+@compiled
 def lowest_eigenvalue(axes: tuple[Axis, Axis], parameters: tuple[Array, Array]) -> Float[Array, ""]:
     """The smallest eigenvalue of the tensor product of both directions' collocation matrices.
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxfit._checks import as_floating, as_points, is_concrete
+from jaxfit._compile import compiled
 from jaxfit._parameters._methods import AbstractParametrisation, ChordLength
 
 _CHORD_LENGTH = ChordLength()
@@ -111,7 +112,7 @@ def _direction(grid: Array, exponent: float, which: str) -> tuple[Array, Array]:
     return average, _own(steps, usable, average)
 
 
-@partial(jax.jit, static_argnames="exponent")
+@partial(compiled, static_argnames="exponent")
 def _rows(grid: Array, exponent: float) -> tuple[Array, Array]:
     """Steps |dQ|^exponent (n-1, m), each column scaled to sum to 1, and the lengths (m,)."""
     differences = jnp.diff(grid, axis=0)
@@ -127,14 +128,14 @@ def _rows(grid: Array, exponent: float) -> tuple[Array, Array]:
     return steps / jnp.where(total > 0, total, 1), lengths
 
 
-@jax.jit
+@compiled
 def _usable(grid: Array, lengths: Array) -> Array:
     """Which columns are longer than the rounding of their coordinates adds up to."""
     noise = 4 * jnp.finfo(grid.dtype).eps * jnp.max(jnp.abs(grid))
     return lengths > noise * (grid.shape[0] - 1)
 
 
-@jax.jit
+@compiled
 def _averaged(steps: Array, usable: Array) -> Array:
     """Mean of the usable columns' parameters, with a least step; uniform if there are none."""
     count = steps.shape[0]
@@ -145,7 +146,7 @@ def _averaged(steps: Array, usable: Array) -> Array:
     return _cumulated(jnp.maximum(mean, max(eps ** (1 / 3) / count, 4 * eps))[:, None])[:, 0]
 
 
-@jax.jit
+@compiled
 def _own(steps: Array, usable: Array, average: Array) -> Array:
     """Each column's own parameters; the average where the column has no length."""
     own = _cumulated(jnp.where(usable[None, :], steps, 1))

@@ -2,13 +2,13 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxfit._compile import compiled
 from jaxfit._splines._lookup import last_not_above, windows
 
 
@@ -113,7 +113,7 @@ def spans_and_weights(
     return span - (order - 1), nonzero_basis(local_knots(knots, order, span), u, derivatives)
 
 
-@partial(jax.jit, static_argnames=("order", "derivatives", "extrapolate"))
+@partial(compiled, static_argnames=("order", "derivatives", "extrapolate"))
 def _stacked(knots: Array, order: int, u: Array, derivatives: tuple[int, ...], extrapolate: bool) -> Array:
     _, weights = spans_and_weights(knots, order, u, derivatives, extrapolate)
     return jnp.moveaxis(weights, 1, -1)

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile import compiled
 from jaxfit._splines._basis import blossom_weights, local_knots
 from jaxfit._splines._lookup import windows
 
@@ -77,7 +77,7 @@ def bezier_along(
     return pieces, jnp.asarray(np.append(values[spans], values[spans[-1] + 1]))
 
 
-@jax.jit
+@compiled
 def _bezier_points(control_points: Array, knots: Array, spans: Array) -> Array:
     order = knots.shape[0] - control_points.shape[0]
     local = local_knots(knots, order, spans)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from jaxfit._compile import compiled
 from jaxfit._splines._basis import spans_and_weights
 from jaxfit._splines._lookup import windows
 
@@ -34,7 +35,7 @@ def in_blocks(kernel: Callable[..., Array], *parameters: Array) -> Array:
     return result.reshape(*shape, *result.shape[1:])
 
 
-@partial(jax.jit, static_argnames=("derivative", "extrapolate"))
+@partial(compiled, static_argnames=("derivative", "extrapolate"))
 def evaluate_curve(
     control_points: Float[Array, "n d"],
     knots: Float[Array, " knots"],
@@ -51,7 +52,7 @@ def evaluate_curve(
     return in_blocks(kernel, u)
 
 
-@partial(jax.jit, static_argnames=("wanted", "extrapolate"))
+@partial(compiled, static_argnames=("wanted", "extrapolate"))
 def evaluate_surface(
     control_points: Float[Array, "nu nv d"],
     knots_u: Float[Array, " knots_u"],
@@ -116,7 +117,7 @@ def _weighted(
     return lax.dot_general(values, weights, (((axis,), (1,)), ((0,), (0,))), precision=lax.Precision.HIGHEST)
 
 
-@partial(jax.jit, static_argnames=("derivatives", "extrapolate"))
+@partial(compiled, static_argnames=("derivatives", "extrapolate"))
 def evaluate_grid(
     control_points: Float[Array, "nu nv d"],
     knots_u: Float[Array, " knots_u"],
@@ -134,7 +135,7 @@ def evaluate_grid(
     return jnp.swapaxes(columns, 0, 1)
 
 
-@partial(jax.jit, static_argnames=("derivative", "extrapolate"))
+@partial(compiled, static_argnames=("derivative", "extrapolate"))
 def contract(
     control_points: Float[Array, "n m d"],
     knots: Float[Array, " knots"],

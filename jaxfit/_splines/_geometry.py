@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfit._compile import compiled
+
 Partials = dict[tuple[int, int], Array]
 
 
@@ -90,7 +92,7 @@ class Curvature(NamedTuple):
     k2: Float[Array, "*shape"]
 
 
-@jax.jit
+@compiled
 def unit_normal(ru: Float[Array, "*shape 3"], rv: Float[Array, "*shape 3"]) -> Float[Array, "*shape 3"]:
     """Unit normal of two tangents, zero where they span no plane."""
     a, b = _unit(ru, 0.0), _unit(rv, 0.0)
@@ -99,20 +101,20 @@ def unit_normal(ru: Float[Array, "*shape 3"], rv: Float[Array, "*shape 3"]) -> F
     return _unit(jnp.cross(a, b), 8 * float(jnp.finfo(ru.dtype).eps))
 
 
-@jax.jit
+@compiled
 def first_form(ru: Float[Array, "*shape d"], rv: Float[Array, "*shape d"]) -> FirstForm:
     """E, F, G of two tangents."""
     return FirstForm(_dot(ru, ru), _dot(ru, rv), _dot(rv, rv))
 
 
-@jax.jit
+@compiled
 def second_form(partials: Partials) -> SecondForm:
     """L, M, N of the partial derivatives up to order two."""
     normal = unit_normal(partials[1, 0], partials[0, 1])
     return SecondForm(*(_dot(partials[key], normal) for key in ((2, 0), (1, 1), (0, 2))))
 
 
-@jax.jit
+@compiled
 def curvature(partials: Partials) -> Curvature:
     """Curvatures from the partial derivatives up to order two."""
     ru, rv = partials[1, 0], partials[0, 1]

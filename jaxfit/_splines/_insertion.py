@@ -2,13 +2,13 @@
 
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from jaxfit._compile import compiled
 from jaxfit._splines._basis import as_parameters, blossom_weights, find_span, local_knots
 from jaxfit._splines._lookup import windows
 
@@ -41,7 +41,7 @@ def insertion_weights(
     return span - (order - 1), weights
 
 
-@partial(jax.jit, static_argnames="order")
+@partial(compiled, static_argnames="order")
 def insertion_matrix(
     knots: Float[Array, " knots"], order: int, new_knots: ArrayLike
 ) -> Float[Array, "refined n"]:
@@ -80,7 +80,7 @@ def insertion_matrix(
     return matrix.at[rows, columns].set(weights.T)
 
 
-@jax.jit
+@compiled
 def insert_along(
     control_points: Float[Array, "n ..."], knots: Float[Array, " knots"], new_knots: ArrayLike
 ) -> tuple[Float[Array, "refined ..."], Float[Array, " refined_knots"]]:
@@ -93,7 +93,7 @@ def insert_along(
     return moved, refined
 
 
-@jax.jit
+@compiled
 def insert_in_net(
     control_points: Float[Array, "nu nv d"],
     knots_u: Float[Array, " knots_u"],

@@ -3,17 +3,18 @@
 Every function takes the paired index first.
 """
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
+
+from jaxfit._compile import compiled
 
 # Of symmetric data the leading eigenvalue stands above the others by the whole sum of squared differences;
 # a direction that does so by less than this share of it is no direction.
 _LEAST_GAP = 0.01
 
 
-@jax.jit
+@compiled
 def mirrored(
     points: Float[Array, "*shape d"], point: Float[Array, " d"], normal: Float[Array, " d"]
 ) -> Float[Array, "*shape d"]:
@@ -21,7 +22,7 @@ def mirrored(
     return points - 2 * _off_plane(points, point, normal)
 
 
-@jax.jit
+@compiled
 def averaged(
     rows: Float[Array, "h m d"],
     partners: Float[Array, "h m d"],
@@ -32,7 +33,7 @@ def averaged(
     return (rows + mirrored(partners, point, normal)) / 2
 
 
-@jax.jit
+@compiled
 def onto_plane(
     points: Float[Array, "*shape d"], point: Float[Array, " d"], normal: Float[Array, " d"]
 ) -> Float[Array, "*shape d"]:
@@ -48,7 +49,7 @@ def _off_plane(points: Array, point: Array, normal: Array) -> Array:
     return jnp.sum((points - centre) * along, axis=-1, keepdims=True) * along
 
 
-@jax.jit
+@compiled
 def best_normal(
     rows: Float[Array, "n m d"], point: Float[Array, " d"]
 ) -> tuple[Float[Array, " d"], Bool[Array, ""]]:
@@ -99,14 +100,14 @@ def _with_derivative(matrix: Array, values: Array, vectors: Array) -> Array:
     return unit(lead + others @ (inverse * slopes))
 
 
-@jax.jit
+@compiled
 def unit(vector: Float[Array, " d"]) -> Float[Array, " d"]:
     """The vector over its length."""
     scaled = vector / jnp.max(jnp.abs(lax.stop_gradient(vector)))
     return scaled / jnp.sqrt(jnp.sum(scaled**2))
 
 
-@jax.jit
+@compiled
 def reversal_mean(
     values: Float[Array, "n *rest"], start: Float[Array, ""], stop: Float[Array, ""]
 ) -> Float[Array, "n *rest"]:
@@ -121,7 +122,7 @@ def reversal_mean(
     return jnp.concatenate([start + (stop - high)[::-1], middle, high])
 
 
-@jax.jit
+@compiled
 def largest_distance(a: Float[Array, "*shape d"], b: Float[Array, "*shape d"]) -> Float[Array, ""]:
     """The largest distance of corresponding points, with gradient zero where all coincide."""
     squared = jnp.max(jnp.sum((a - b) ** 2, axis=-1))
