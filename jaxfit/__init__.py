@@ -69,6 +69,8 @@ from jaxfit._parameters import Centripetal as Centripetal
 from jaxfit._parameters import ChordLength as ChordLength
 from jaxfit._parameters import curve_parameters as curve_parameters
 from jaxfit._parameters import grid_parameters as grid_parameters
+from jaxfit._quality import Regularity as Regularity
+from jaxfit._quality import regularity as regularity
 from jaxfit._quality import zebra as zebra
 from jaxfit._splines import BezierCurves as BezierCurves
 from jaxfit._splines import BezierPatches as BezierPatches

@@ -7,7 +7,7 @@ import pytest
 from helpers import clamped_uniform, data, eps, random_clamped_knots, wavy_surface
 
 from jaxfit import BSplineSurface, Reflection, averaging_knots, grid_parameters, zebra
-from jaxfit._quality import zebra_grid
+from jaxfit._quality._zebra import zebra_grid
 
 SIZES = [(6, 5), (7, 5)]
 

@@ -4,6 +4,7 @@ from jaxfit._normal_equations._coupled_preconditioner import coupled_preconditio
 from jaxfit._normal_equations._coupled_preconditioner import solve_coupled as solve_coupled
 from jaxfit._normal_equations._coupled_stencil import CoupledStencil as CoupledStencil
 from jaxfit._normal_equations._coupled_stencil import coupled_stencil as coupled_stencil
+from jaxfit._normal_equations._curvature_energy import curvature_density as curvature_density
 from jaxfit._normal_equations._curvature_energy import curvature_energy as curvature_energy
 from jaxfit._normal_equations._normal_operator import BlockCholesky as BlockCholesky
 from jaxfit._normal_equations._normal_operator import NormalOperator as NormalOperator

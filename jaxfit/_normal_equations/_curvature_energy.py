@@ -5,12 +5,14 @@ $$\int \kappa_1^2 + \kappa_2^2 \; dA = \int (4 H^2 - 2 K)\, |R_u \times R_v| \, 
 It does not depend on the parametrisation, nor on the size of the surface, and is what (10) stands for.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet, evaluate_jet
+from jaxfit._cells import evaluate_jet
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._pieces import make_pieces
 
@@ -59,22 +61,22 @@ def curvature_energy(surface: BSplineSurface, points: int = 6) -> Float[Array, "
     s, t = (jnp.asarray(x.reshape(-1), net.dtype) for x in np.meshgrid(nodes, nodes, indexing="ij"))
     s, t = (jnp.broadcast_to(x, (pieces.cells, x.size)) for x in (s, t))
     weight = jnp.asarray(np.outer(weights, weights).reshape(-1), net.dtype)
-    density = _density(evaluate_jet(jnp.asarray(pieces.coefficients), s, t))
+    density = curvature_density(*evaluate_jet(jnp.asarray(pieces.coefficients), s, t)[1:])
     # The integrand needs no parameters: in local coordinates every cell is [-1, 1]^2. Empty ones are skipped.
     width_u, width_v = (jnp.diff(jnp.asarray(x.breaks)) > 0 for x in (pieces.axis_u, pieces.axis_v))
     taken = (width_u[:, None] & width_v[None, :]).reshape(-1)
     return jnp.sum(jnp.where(taken[:, None], density * weight[None], 0.0))
 
 
-def _density(jet: Jet) -> Float[Array, "cells points"]:
-    """(4 H^2 - 2 K) times the element of area, from the derivatives."""
-    e, f, g = (jnp.sum(a * b, axis=0) for a, b in ((jet.s, jet.s), (jet.s, jet.t), (jet.t, jet.t)))
-    normal = jnp.cross(jet.s, jet.t, axis=0)
-    area = jnp.sum(normal**2, axis=0)  # the square of the element of area, e g - f^2
+def curvature_density(s: Any, t: Any, ss: Any, st: Any, tt: Any) -> Any:
+    """(4 H^2 - 2 K) times the element of area, from the derivatives (3, ...), NumPy's or JAX's."""
+    xp: Any = np if isinstance(s, np.ndarray) else jnp
+    e, f, g = (xp.sum(a * b, axis=0) for a, b in ((s, s), (s, t), (t, t)))
+    normal = xp.cross(s, t, axis=0)
+    area = xp.sum(normal**2, axis=0)  # the square of the element of area, e g - f^2
     regular = area > 0
-    area = jnp.where(regular, area, 1.0)
-    second = (jet.ss, jet.st, jet.tt)
-    ll, m, n = (jnp.sum(x * normal, axis=0) for x in second)  # times the root of `area`
+    area = xp.where(regular, area, 1.0)
+    ll, m, n = (xp.sum(x * normal, axis=0) for x in (ss, st, tt))  # times the root of `area`
     mean = (e * n - 2.0 * f * m + g * ll) / area  # 2 H, likewise
     gauss = (ll * n - m**2) / area
-    return jnp.where(regular, (mean**2 - 2.0 * gauss) / jnp.sqrt(area), 0.0)
+    return xp.where(regular, (mean**2 - 2.0 * gauss) / xp.sqrt(area), 0.0)

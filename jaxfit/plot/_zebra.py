@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfit._checks import as_direction, check_kind
-from jaxfit._quality import Vector, zebra_grid
+from jaxfit._quality._zebra import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
 from jaxfit.plot._picture import blank_figure, save
 from jaxfit.plot._render import coarse_points, render
