@@ -9,6 +9,7 @@ import pytest
 from helpers import wavy_surface
 from scipy.ndimage import binary_fill_holes
 
+import jaxfit as jf
 from jaxfit.plot import surface_and_errors
 from jaxfit.plot._render import render
 from jaxfit.plot._view import choose_view
@@ -23,8 +24,11 @@ def small(monkeypatch):
 
 def fake_fit(shape, surface=None, seed=0):
     u, v, errors = np.random.default_rng(seed).uniform(size=(3, *shape))
+    surface = wavy_surface() if surface is None else surface
     return SimpleNamespace(
-        surface=wavy_surface() if surface is None else surface,
+        surface=surface,
+        regularity=jf.regularity(surface),
+        stats={"diagonal": 2.0},
         u=u,
         v=v,
         errors=1e-3 * errors,
@@ -45,7 +49,7 @@ def test_a_picture_is_saved_and_returned(tmp_path, suffix):
     assert (tmp_path / f"p{suffix}").stat().st_size > 10_000
     assert [path.name for path in tmp_path.iterdir()] == [f"p{suffix}"]
     said = [text.get_text() for axes in figure.axes for text in (axes.title, axes.yaxis.label)]
-    assert "7 \N{MULTIPLICATION SIGN} 6 control points" in said
+    assert any(text.startswith("7 \N{MULTIPLICATION SIGN} 6 control points, no folds\n") for text in said)
     assert "error, % of the diagonal" in said
     assert any(text.startswith("average 0.0") and "maximum 0." in text for text in said)
 
@@ -131,3 +135,26 @@ def test_missing_matplotlib_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"jaxfit-surfaces\[plot\]"):
         surface_and_errors(fake_fit((50,)))
+
+
+def test_folds_are_marked_in_both_halves():
+    """A strip pulled back over itself, seen from above: red there and nowhere else."""
+    smooth = fake_fit((50,))
+    folded = fake_fit((50,), with_points(lambda p: p + 0.9 * np.eye(7)[3][:, None, None] * np.eye(3)[0]))
+    red = []
+    for fit in (smooth, folded):
+        image, _ = render(fit.surface, folds=fit.regularity.fold_parameters)
+        red.append(int(np.sum((image[..., 0] > 0.8) & (image[..., 1] < 0.2) & (image[..., 3] > 0))))
+    assert folded.regularity.folds > 100
+    assert red[0] == 0 < red[1]
+    figure = surface_and_errors(folded)
+    crosses = [x for x in figure.axes[1].collections if x.get_label() == "folds"]
+    np.testing.assert_allclose(crosses[0].get_offsets(), folded.regularity.fold_parameters)
+    assert f"{folded.regularity.folds:,} folds" in figure.axes[0].get_title()
+
+
+def test_folds_of_a_grid_are_marked_at_its_rows_and_columns():
+    fit = fake_fit((9, 8), with_points(lambda p: p + 0.9 * np.eye(7)[3][:, None, None] * np.eye(3)[0]))
+    fit.u, fit.v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 8), indexing="ij")
+    crosses = surface_and_errors(fit).axes[1].collections[0].get_offsets()
+    np.testing.assert_allclose(crosses, fit.regularity.fold_parameters * [8, 7], atol=1e-12)

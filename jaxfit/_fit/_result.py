@@ -1,5 +1,6 @@
 """`Fit`, the result of every fit."""
 
+from functools import cached_property
 from typing import Any
 
 import equinox as eqx
@@ -11,7 +12,8 @@ from jaxtyping import Float
 from jaxfit._checks import is_concrete
 from jaxfit._fit._history import History
 from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._summary import describe, describe_briefly
+from jaxfit._fit._summary import describe, describe_briefly, with_folds
+from jaxfit._quality import Regularity, regularity
 from jaxfit._splines import BSplineSurface
 
 
@@ -37,7 +39,10 @@ class Fit(eqx.Module):
     history : History
         Errors, evaluations and parameter changes of every iteration.
     result : item of RESULTS
-        Why the fit stopped; `converged` and `message` give it as a boolean and as a sentence.
+        Why the fit stopped; `converged` and `message` give it as a boolean and as a sentence. A fit may meet
+        its tolerances with a surface that folds; the sentence then says so.
+    regularity : Regularity
+        Number and places of folds, parameter lines and energies of the surface, measured on first use.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
         foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
@@ -76,17 +81,30 @@ class Fit(eqx.Module):
         """Whether all tolerances are met."""
         return self.result == RESULTS.converged
 
+    @cached_property
+    def regularity(self) -> Regularity:
+        """Folds, parameter lines and energies of the surface; see `jaxfit.regularity`.
+
+        Measured on the host when it is first asked for, and kept. Raises TypeError while the fit is traced
+        and ValueError for a batch, of which `jax.tree.map(lambda x: x[i], fit)` is a fit.
+        """
+        return regularity(self.surface)
+
     @property
     def message(self) -> str:
-        """Why the fit stopped, and for a symmetrised grid what the errors refer to."""
+        """Why the fit stopped, whether its surface folds, and what the errors of a symmetrised grid refer to.
+
+        Folds are those of `regularity`; a fit that is traced or one of a batch does not tell.
+        """
         sentences: Any = RESULTS
+        sentence = with_folds(self, sentences[self.result])
         moved = 0.5 * self.stats.get("asymmetry", 0.0)
         if is_concrete(moved) and np.ndim(moved) == 0 and moved > self.stats.get("tolerance", np.inf):
             return (
-                f"{sentences[self.result]} Errors are measured to the symmetrised grid, whose points lie up "
+                f"{sentence} Errors are measured to the symmetrised grid, whose points lie up "
                 f"to {float(moved):.2g} of the diagonal away from the given ones."
             )
-        return sentences[self.result]
+        return sentence
 
 
 def converged_or_raise(fit: Fit) -> Fit:

@@ -3,45 +3,105 @@
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxfit._checks import is_concrete
+from jaxfit._quality import Regularity
 from jaxfit._splines import BSplineSurface
 
 if TYPE_CHECKING:
     from jaxfit._fit._result import Fit
 
 
+_REMEDIES = {
+    True: "look at the order of the grid's points there (fit.regularity.fold_parameters)",
+    False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
+}  # by whether the fit is an interpolation
+
+
 def facts(fit: Any) -> dict[str, str]:
-    """Names and values for a table: net, order, iterations, errors in per cent, and why the fit stopped."""
+    """Names and values for a table: net, order, iterations, errors in per cent, how regular the surface is,
+    and why the fit stopped.
+    """
     return {
         "net": "{} x {}".format(*fit.surface.shape),
         "order": "{} x {}".format(*fit.surface.order),
         "iterations": str(int(fit.stats["num_steps"])),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal",
+        **_regularity_facts(fit),
         "stopped": fit.message,
     }
 
 
+def _regularity_facts(fit: Any) -> dict[str, str]:
+    if not _is_finite(fit):
+        return {}
+    found: Regularity = fit.regularity
+    unit = float(fit.stats.get("diagonal", 1.0)) ** 2
+    energy = f"thin plate {found.thin_plate_energy / unit:.4g} squared diagonals"
+    if found.curvature_energy is not None:
+        energy += f", curvature {found.curvature_energy:.4g}"
+    without = {} if not found.degenerate else {"no normal": f"at {found.degenerate:,} of {_samples(found)}"}
+    least, largest = found.line_ratios
+    return {
+        "folds": f"at {_places(found)}{_largest_group(found)}" if found.folds else "none",
+        **without,
+        "parameter lines": f"at least {np.degrees(found.smallest_angle):.3g} degrees apart, "
+        f"ratio {least:.2g} to {largest:.2g}",
+        "energies": energy,
+    }
+
+
+def _samples(found: Regularity) -> str:
+    return f"{found.samples[0] * found.samples[1]:,} samples"
+
+
+def _places(found: Regularity) -> str:
+    return f"{found.folds:,} of {found.pairs:,} places"
+
+
+def _largest_group(found: Regularity) -> str:
+    """Where most folds are: the fold in the middle of the largest group."""
+    places = found.fold_parameters[found.fold_groups == 0]
+    middle = places[np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1))]
+    groups = f" in {found.groups:,} groups, most" if found.groups > 1 else ","
+    return "{} round u = {:.3g}, v = {:.3g}".format(groups, *middle)
+
+
+def with_folds(fit: Any, sentence: str) -> str:
+    """The reason for which a fit stopped, and that its surface folds if it does."""
+    if not (is_single(fit) and _is_finite(fit) and fit.regularity.folds):
+        return sentence
+    folds = f"the surface folds at {_places(fit.regularity)}: {_REMEDIES['method' not in fit.stats]}."
+    if bool(fit.converged):
+        return f"{sentence.removesuffix('.')}, but {folds}"
+    return f"{sentence} T{folds[1:]}"
+
+
+def _is_finite(fit: Any) -> bool:
+    return all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(fit.surface))
+
+
 def describe(fit: "Fit") -> str:
     """`str(fit)`: its `facts`, one a line; the shapes of its arrays where it is traced or one of a batch."""
-    if not _is_single(fit):
+    if not is_single(fit):
         return eqx.tree_pformat(fit)
     rows = {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)}
-    return "\n".join(f"{name:<15}{value}" for name, value in rows.items())
+    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
 
 
 def describe_briefly(fit: "Fit") -> str:
     """`repr(fit)`, on one line."""
-    if not _is_single(fit):
+    if not is_single(fit):
         return eqx.tree_pformat(fit)
     said = facts(fit)
     errors = ", ".join(f"{which} error {said[f'{which} error']}" for which in ("average", "maximum"))
     return f"<Fit: {said['net']} control points, {errors.replace(' of the diagonal,', ',')}; {fit.message}>"
 
 
-def _is_single(fit: "Fit") -> bool:
+def is_single(fit: "Fit") -> bool:
     if not (isinstance(fit.surface, BSplineSurface) and is_concrete(fit)):
         return False
     numbers = [np.asarray(x) for x in (fit.average_error, fit.maximum_error, fit.stats.get("num_steps"))]

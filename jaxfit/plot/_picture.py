@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _LARGEST_SCATTER = 20_000  # points; more are drawn as a raster
 _COLOURS = "inferno"
+_FOLDS = "deepskyblue"  # which the colours of errors are not
 
 
 def surface_and_errors(
@@ -34,7 +35,9 @@ def surface_and_errors(
     diagonal of the data's bounding box, over the parameters (u, v) of the points, or over the
     rows and columns of a grid; colours end at the 99.5th percentile, so that a few outliers do
     not hide the rest. Of more than 20,000 scattered points every cell of a raster shows its
-    largest error. Neither pyplot nor a backend is touched.
+    largest error. Folds of the surface (`fit.regularity`) are red on the left and crosses on the
+    right; the caption counts them. It has the smallest angle between parameter lines and the
+    thin-plate energy in squared diagonals, too. Neither pyplot nor a backend is touched.
 
     Parameters
     ----------
@@ -64,7 +67,7 @@ def surface_and_errors(
     errors = _arrange(fit.errors, points)
     figure = blank_figure(12)
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
-    view = _draw_surface(left, fit.surface)
+    view = _draw_surface(left, fit)
     _draw_errors(right, fit, 100 * errors, view)
     if title:
         figure.suptitle(title, fontsize=14, fontweight="bold")
@@ -86,16 +89,25 @@ def _arrange(errors: ArrayLike, points: ArrayLike | None) -> np.ndarray:
     return errors.reshape(shape)
 
 
-def _draw_surface(axes: "Axes", surface: Any) -> View:
-    image, view = render(surface)
+def _draw_surface(axes: "Axes", fit: Any) -> View:
+    image, view = render(fit.surface, folds=fit.regularity.fold_parameters)
     axes.imshow(image)
     axes.set_axis_off()
-    nu, nv = surface.shape
-    caption = f"{nu} \N{MULTIPLICATION SIGN} {nv} control points"
+    axes.set_title(_caption(fit, view), fontsize=11)
+    return view
+
+
+def _caption(fit: Any, view: View) -> str:
+    found = fit.regularity
+    folds = {0: "no folds", 1: "1 fold"}.get(found.folds, f"{found.folds:,} folds")
+    caption = "{} \N{MULTIPLICATION SIGN} {} control points, {}".format(*fit.surface.shape, folds)
     if view.factor > 1:
         caption += f", {view.relief} stretched {view.factor} times"
-    axes.set_title(caption, fontsize=11)
-    return view
+    plate = found.thin_plate_energy / float(fit.stats["diagonal"]) ** 2
+    return (
+        f"{caption}\nlines at least {np.degrees(found.smallest_angle):.3g}\N{DEGREE SIGN} apart, "
+        f"thin-plate energy {plate:.4g}"
+    )
 
 
 def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None:
@@ -120,6 +132,7 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
             size = np.clip(7e4 / errors.size, 1.5, 60.0)
             drawn = axes.scatter(u, v, c=errors, s=size, linewidths=0, **style)
         axes.margins(0.02)
+    _mark_folds(axes, fit, errors.shape)
     _turn_like_the_surface(axes, fit.surface, view)
     bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02)
     bar.set_label(label)
@@ -128,6 +141,20 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
         f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal",
         fontsize=11,
     )
+
+
+def _mark_folds(axes: "Axes", fit: Any, shape: tuple[int, ...]) -> None:
+    """A cross at each fold, over the parameters or over the rows and columns of a grid."""
+    places = fit.regularity.fold_parameters
+    if not len(places):
+        return
+    at = list(places.T)
+    if len(shape) == 2:
+        for axis, parameters in enumerate((fit.u, fit.v)):
+            line = np.asarray(parameters, float).reshape(shape).mean(axis=1 - axis)
+            at[axis] = np.interp(at[axis], np.maximum.accumulate(line), np.arange(shape[axis]))
+    axes.scatter(at[0], at[1], marker="x", s=12, linewidths=0.8, color=_FOLDS, label="folds")
+    axes.legend(loc="upper right", fontsize=8)
 
 
 def _largest_per_cell(

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxfit._base._host_splines import basis_matrix
 from jaxfit._splines import BSplineSurface
@@ -20,6 +20,8 @@ _INDEX_BITS = 32
 _PLAIN = np.array([0.84, 0.80, 0.72])
 _HEIGHTS = np.array([[0.47, 0.57, 0.44], [0.80, 0.77, 0.60], [0.70, 0.57, 0.45], [0.96, 0.94, 0.91]])
 _LINE = np.array([0.13, 0.25, 0.40], np.float32)
+FOLD = np.array([0.86, 0.10, 0.16], np.float32)
+_FOLD_RADIUS = 6  # in samples, so about five raw pixels
 _LIGHT = np.array([-0.68, 0.42, 0.60])  # from the upper left, in front of the picture
 
 
@@ -28,11 +30,13 @@ def render(
     aspect: float = 1.1,
     view: View | None = None,
     paint: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    folds: Float[np.ndarray, "folds 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "height width 4"], View]:
     """The surface in RGBA with shading and some of its knot lines, and the view it is seen in.
 
     The picture is transparent round the surface, and `aspect` times as wide as high. A `paint`
-    gives the colours (a, b, 3) at parameters (a,) and (b,); nothing is shaded or drawn on them.
+    gives the colours (a, b, 3) at parameters (a,) and (b,); nothing is shaded or drawn on them but red spots
+    at the parameters of `folds`, where they can be seen.
     """
     us, vs, coarse = coarse_points(surface)
     view = choose_view(coarse) if view is None else view
@@ -59,6 +63,8 @@ def render(
             near = _near_a_knot(np.asarray(knots, dtype=float), at)[number]
             colour[near] = 0.5 * colour[near] + 0.5 * _LINE
         image[filled, :3] = np.clip(colour, 0, 1)
+    if folds is not None and len(folds):
+        image[filled, :3] = np.where(_near(folds, us, vs).ravel()[index, None], FOLD, image[filled, :3])
     return _pad(_halve(image), aspect), view
 
 
@@ -140,6 +146,18 @@ def _near_a_knot(knots: np.ndarray, at: np.ndarray) -> np.ndarray:
     nearest = np.searchsorted(at, np.append(knots[:-1:every], knots[-1]))
     near = np.zeros(len(at), bool)
     near[np.clip(nearest[:, None] + np.arange(-1, 2), 0, len(at) - 1)] = True
+    return near
+
+
+def _near(places: np.ndarray, us: np.ndarray, vs: np.ndarray) -> Bool[np.ndarray, "a b"]:
+    """Which samples lie in a square round one of the parameters `places`."""
+    near = np.zeros((len(us), len(vs)), bool)
+    i, j = (np.searchsorted(at, places[:, k]) for k, at in enumerate((us, vs)))
+    reach = np.arange(-_FOLD_RADIUS, _FOLD_RADIUS + 1)
+    rows, columns = (
+        np.clip(x[:, None] + reach, 0, len(at) - 1) for x, at in zip((i, j), (us, vs), strict=True)
+    )
+    near[rows[:, :, None], columns[:, None, :]] = True
     return near
 
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfit._checks import as_direction, check_kind
+from jaxfit._quality import regularity
 from jaxfit._quality._zebra import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
 from jaxfit.plot._picture import blank_figure, save
-from jaxfit.plot._render import coarse_points, render
+from jaxfit.plot._render import FOLD, coarse_points, render
 from jaxfit.plot._view import View, choose_view, view_from
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 _DARK = np.array([0.07, 0.09, 0.13])
 _BRIGHT = np.array([0.97, 0.96, 0.93])
-_NO_NORMAL = np.array([0.85, 0.20, 0.20])
 _SHARPNESS = 4.0  # a wave of this height, cut at 0 and 1, is nearly a step
 
 
@@ -36,8 +36,8 @@ def zebra_stripes(
     """One picture of the zebra stripes of one or several surfaces, side by side in one view.
 
     Stripes show what shading hides: where they wiggle, kink or break, so do curvatures and normals.
-    The stripes are those of `jaxfit.zebra`, cut nearly sharp; places without a normal are
-    red. Neither pyplot nor a backend is touched.
+    The stripes are those of `jaxfit.zebra`, cut nearly sharp; places without a normal, and
+    folds (`jaxfit.regularity`), are red. Neither pyplot nor a backend is touched.
 
     Parameters
     ----------
@@ -91,9 +91,9 @@ def _striped(surface: BSplineSurface, camera: View, axis: Vector, stripes: int) 
     def paint(us: np.ndarray, vs: np.ndarray) -> np.ndarray:
         values = np.asarray(zebra_grid(surface, us, vs, axis, stripes, camera.toward), dtype=float)
         bright = np.clip(0.5 + _SHARPNESS * (values - 0.5), 0, 1)[..., None]
-        return np.where(np.isnan(bright), _NO_NORMAL, _DARK + bright * (_BRIGHT - _DARK))
+        return np.where(np.isnan(bright), FOLD, _DARK + bright * (_BRIGHT - _DARK))
 
-    return render(surface, view=camera, paint=paint)[0]
+    return render(surface, view=camera, paint=paint, folds=regularity(surface).fold_parameters)[0]
 
 
 def _camera(surface: BSplineSurface, view: Vector | None) -> View:
