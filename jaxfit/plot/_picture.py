@@ -136,11 +136,11 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
     _turn_like_the_surface(axes, fit.surface, view)
     bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02)
     bar.set_label(label)
-    axes.set_title(
+    caption = (
         f"average {100 * float(fit.average_error):.3g} %, "
-        f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal",
-        fontsize=11,
+        f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal"
     )
+    axes.set_title(caption + ("\ncrosses: folds" if fit.regularity.folds else ""), fontsize=11)
 
 
 def _mark_folds(axes: "Axes", fit: Any, shape: tuple[int, ...]) -> None:
@@ -154,7 +154,6 @@ def _mark_folds(axes: "Axes", fit: Any, shape: tuple[int, ...]) -> None:
             line = np.asarray(parameters, float).reshape(shape).mean(axis=1 - axis)
             at[axis] = np.interp(at[axis], np.maximum.accumulate(line), np.arange(shape[axis]))
     axes.scatter(at[0], at[1], marker="x", s=12, linewidths=0.8, color=_FOLDS, label="folds")
-    axes.legend(loc="upper right", fontsize=8)
 
 
 def _largest_per_cell(
