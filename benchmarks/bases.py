@@ -3,9 +3,8 @@
     python benchmarks/bases.py [--data FOLDER] [--max-steps N] [name ...]
 
 Distances are to true closest points, in % of the diagonal of the cloud's bounding box. Fits are those of the
-default method, to the average error named or for as many iterations as allowed. `folds` counts, on a grid of
-400 x 400 parameters, the neighbours whose normals point opposite ways: where the surface folds over, or turns
-more sharply than the grid shows.
+default method, to the average error named or for as many iterations as allowed. `folds` are those of
+`jaxfit.regularity`: where the surface folds over, or turns more sharply than its samples show.
 """
 
 import argparse
@@ -33,13 +32,6 @@ CLOUDS = {
 METHODS = {"Coons": jf.Coons(), "dynamic": jf.DynamicBaseSurface(), "meshless": jf.Meshless()}
 
 
-def folds(surface):
-    at = np.linspace(0.0, 1.0, 400)
-    normals = np.asarray(surface.normal(*np.meshgrid(at, at, indexing="ij")))
-    pairs = (normals[1:], normals[:-1]), (normals[:, 1:], normals[:, :-1])
-    return sum(int(np.sum(np.sum(a * b, axis=2) < 0)) for a, b in pairs)
-
-
 def row(name, label, points, boundary, max_steps, target):
     net, usual = CLOUDS[name]
     begun = time.perf_counter()
@@ -51,9 +43,9 @@ def row(name, label, points, boundary, max_steps, target):
     fit = jf.approximate(points, base, tol_average=target, max_steps=max_steps)
     print(
         f"{name:<16}{label:<10}{'{} x {}'.format(*net):>8}{seconds:>7.1f}"
-        f"{distance.mean():>10.4f}{distance.max():>9.3f}{folds(base):>8}"
+        f"{distance.mean():>10.4f}{distance.max():>9.3f}{jf.regularity(base).folds:>8}"
         f"{int(fit.stats['num_steps']):>7}{100 * float(fit.average_error):>10.4f}"
-        f"{100 * float(fit.maximum_error):>9.3f}{folds(fit.surface):>8}",
+        f"{100 * float(fit.maximum_error):>9.3f}{fit.regularity.folds:>8}",
         flush=True,
     )
 

@@ -5,13 +5,18 @@
 All methods start from one dynamic base surface on one net and stop at the same average error, so that the
 zebra stripes and the energies show what each does to the rest of the surface. The curvature energy (9) is
 that of the surface, the thin-plate energy (10) that of its parametrisation, over the squared diagonal, and
-`folds` are neighbours on a grid of 400 x 400 parameters whose normals point opposite ways.
+`folds` are those of `jaxfit.regularity`.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
-import bases
+import jax
+
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 import helpers
 import numpy as np
 
@@ -25,22 +30,6 @@ METHODS = {
     "standard": jf.StandardApproximation(smoothing=2e-5),
     "orthogonal distance": jf.OrthogonalDistance(smoothing=2e-5),
 }
-
-
-def bending_energy(surface):
-    """Equation (10) of a bicubic surface on [0, 1]^2: Gauss's rule in every knot span, which is exact."""
-    (u, weight_u), (v, weight_v) = (gauss(knots) for knots in (surface.knots_u, surface.knots_v))
-    at = np.meshgrid(u, v, indexing="ij")
-    squares = [np.sum(np.asarray(surface.derivative(*at, 2 - d, d)) ** 2, axis=-1) for d in range(3)]
-    return float(weight_u @ (squares[0] + 2 * squares[1] + squares[2]) @ weight_v)
-
-
-def gauss(knots, order=4):
-    """Nodes and weights over the spans between the knots."""
-    nodes, weights = np.polynomial.legendre.leggauss(order)
-    breaks = np.unique(np.asarray(knots))
-    centre, half = (breaks[1:] + breaks[:-1]) / 2, np.diff(breaks) / 2
-    return (centre[:, None] + half[:, None] * nodes).ravel(), (half[:, None] * weights).ravel()
 
 
 def main():
@@ -61,15 +50,15 @@ def main():
     for title, method in METHODS.items():
         most = 200 if method else 0
         fit = jf.approximate(points, base, method, tol_average=options.target, max_steps=most)
-        surface, size = fit.surface, float(fit.stats["diagonal"])
-        plate = bending_energy(surface) / size**2
+        found = fit.regularity
+        plate = found.thin_plate_energy / float(fit.stats["diagonal"]) ** 2
         print(
             f"{title:<24}{int(fit.stats['num_steps']):>6}{100 * float(fit.average_error):>11.4f}"
-            f"{100 * float(fit.maximum_error):>11.4f}{float(jf.curvature_energy(surface)):>12.4g}"
-            f"{plate:>10.4g}{bases.folds(surface):>7}",
+            f"{100 * float(fit.maximum_error):>11.4f}{found.curvature_energy:>12.4g}"
+            f"{plate:>10.4g}{found.folds:>7}",
             flush=True,
         )
-        surfaces.append(surface)
+        surfaces.append(fit.surface)
     zebra_stripes(
         surfaces, options.picture, list(METHODS), title="{}, {} x {}".format(options.name, *base.shape)
     )

@@ -10,7 +10,7 @@ from helpers import wavy_surface
 from scipy.ndimage import binary_fill_holes
 
 import jaxfit as jf
-from jaxfit.plot import surface_and_errors
+from jaxfit.plot import surface_and_errors, zebra_stripes
 from jaxfit.plot._render import render
 from jaxfit.plot._view import choose_view
 
@@ -158,3 +158,14 @@ def test_folds_of_a_grid_are_marked_at_its_rows_and_columns():
     fit.u, fit.v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 8), indexing="ij")
     crosses = surface_and_errors(fit).axes[1].collections[0].get_offsets()
     np.testing.assert_allclose(crosses, fit.regularity.fold_parameters * [8, 7], atol=1e-12)
+
+
+def test_zebra_stripes_stand_below_the_shaded_surfaces():
+    figure = zebra_stripes([wavy_surface()] * 2, captions=["a", "b"], shaded=True)
+    sizes = [axes.images[0].get_array().shape for axes in figure.axes]
+    assert len(sizes) == 4
+    assert len(set(sizes)) == 1
+    assert [axes.get_title() for axes in figure.axes] == ["a", "b", "", ""]
+    seen = (np.asarray(figure.axes[i].images[0].get_array()) for i in (0, 2))
+    shaded, striped = (image[image[..., 3] > 0.99][:, :3] for image in seen)
+    assert np.std(striped) > 2 * np.std(shaded)

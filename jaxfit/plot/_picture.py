@@ -185,8 +185,8 @@ def _turn_like_the_surface(axes: "Axes", surface: Any, view: View) -> None:
         axes.invert_yaxis()
 
 
-def blank_figure(width: int) -> "Figure":
-    """A figure of this many inches by 5.2, without pyplot."""
+def blank_figure(width: int, rows: int = 1) -> "Figure":
+    """A figure of this many inches by 5.2 for each row, without pyplot."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -194,7 +194,7 @@ def blank_figure(width: int) -> "Figure":
         raise ImportError(
             "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
         ) from error
-    figure = Figure(figsize=(width, 5.2), layout="constrained")
+    figure = Figure(figsize=(width, 5.2 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

@@ -32,6 +32,7 @@ def zebra_stripes(
     view: Vector | None = None,
     title: str = "",
     dpi: int = 150,
+    shaded: bool = False,
 ) -> "Figure":
     """One picture of the zebra stripes of one or several surfaces, side by side in one view.
 
@@ -58,6 +59,8 @@ def zebra_stripes(
         Heading, for instance the name of the data.
     dpi
         Pixels per inch; each surface takes 6 x 5.2 inches.
+    shaded
+        Whether to show each surface shaded as well, above its stripes and in the same view.
 
     Returns
     -------
@@ -73,13 +76,18 @@ def zebra_stripes(
     drawn = _checked(surfaces, captions)
     camera = _camera(drawn[0], view)
     axis = camera.up if direction is None else direction
-    figure = blank_figure(6 * len(drawn))
-    axes = figure.subplots(1, len(drawn), squeeze=False)[0]
-    for i, (surface, place) in enumerate(zip(drawn, axes, strict=True)):
-        place.imshow(_striped(surface, camera, axis, stripes))
-        place.set_axis_off()
+    rows = 2 if shaded else 1
+    figure = blank_figure(6 * len(drawn), rows)
+    axes = figure.subplots(rows, len(drawn), squeeze=False)
+    for i, surface in enumerate(drawn):
+        places = regularity(surface).fold_parameters
+        if shaded:
+            axes[0, i].imshow(render(surface, view=camera, folds=places)[0])
+        axes[-1, i].imshow(_striped(surface, camera, axis, stripes, places))
         if captions:
-            place.set_title(captions[i], fontsize=11)
+            axes[0, i].set_title(captions[i], fontsize=11)
+    for place in axes.flat:
+        place.set_axis_off()
     if title:
         figure.suptitle(title, fontsize=14, fontweight="bold")
     if path is not None:
@@ -87,13 +95,15 @@ def zebra_stripes(
     return figure
 
 
-def _striped(surface: BSplineSurface, camera: View, axis: Vector, stripes: int) -> np.ndarray:
+def _striped(
+    surface: BSplineSurface, camera: View, axis: Vector, stripes: int, folds: np.ndarray
+) -> np.ndarray:
     def paint(us: np.ndarray, vs: np.ndarray) -> np.ndarray:
         values = np.asarray(zebra_grid(surface, us, vs, axis, stripes, camera.toward), dtype=float)
         bright = np.clip(0.5 + _SHARPNESS * (values - 0.5), 0, 1)[..., None]
         return np.where(np.isnan(bright), FOLD, _DARK + bright * (_BRIGHT - _DARK))
 
-    return render(surface, view=camera, paint=paint, folds=regularity(surface).fold_parameters)[0]
+    return render(surface, view=camera, paint=paint, folds=folds)[0]
 
 
 def _camera(surface: BSplineSurface, view: Vector | None) -> View:
