@@ -1,5 +1,6 @@
 """`GeometricInterpolation`: section 3 of the paper."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._checks import check_kind, check_number, is_concrete
+from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import measure_grid, side_bounds
@@ -21,6 +22,7 @@ from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
+from jaxfit._interpolation._foot_bounds import bounds_between, is_within
 from jaxfit._interpolation._geometric_fit import geometric_fit
 from jaxfit._interpolation._method import (
     AbstractInterpolation,
@@ -36,11 +38,13 @@ from jaxfit._splines import Reflection
 
 
 class GeometricState(eqx.Module):
-    """The surface with the smallest maximum error so far; feet before the first moves, which derivatives
-    replay (NaN where there are none); and the smallest eigenvalue of the collocation matrix, where a choice
-    of the method asks for it.
+    """The feet of the next move, and their bounds; the surface with the smallest maximum error so far; feet
+    before the first moves, which derivatives replay (NaN where there are none, or where the foot has stayed);
+    and the smallest eigenvalue of the collocation matrix, where a choice of the method asks for it.
     """
 
+    feet: Float[Any, "2 points"]
+    bounds: Float[Any, "2 2 points"]
     best: WorkingSurface
     projection: Projection
     maximum: Float[Any, ""]
@@ -61,9 +65,9 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     until the errors there meet the tolerance. New closest points then give the exact errors, and if these do
     not meet it, the iteration resumes from them.
 
-    Plain, as in (12)-(14), it is `GeometricInterpolation(repositioning=UnitWeights(), freeze_after=None)`:
-    the slowest errors then fall by a factor of about 0.92 an iteration, so 1e-12 of the diagonal takes some
-    200.
+    Plain, as in (12)-(14), it is `GeometricInterpolation(repositioning=UnitWeights(), freeze_after=None,
+    solve_stalled=False)`: the slowest errors then fall by a factor of about 0.92 an iteration, so 1e-12 of
+    the diagonal takes some 200.
 
     Parameters
     ----------
@@ -101,14 +105,23 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     stall_window, stall_gain : int, float
         The fit stops as stalled when neither error has fallen by the share `stall_gain` within
         `stall_window` iterations, as it does at rounding level. It then returns the best surface whose
-        closest points it has computed.
+        closest points it has computed, or that of `solve_stalled`.
+    solve_stalled : bool, default True
+        Whether a fit that stalls above rounding level makes one last step: it solves the linear system at the
+        parameters of the grid, and returns its solution, that of `StandardInterpolation`, where that is
+        closer. So that this comes soon, `stall_gain` is then at least 0.75: a fit that would need more than
+        some 600 iterations counts as stalled. Inside transformations (`jit`, `grad`, `vmap`) nothing is
+        solved, and such a fit ends as stalled; use `StandardInterpolation` there.
 
     Notes
     -----
     It converges where the eigenvalues of the collocation matrix at the feet, times the weights, lie between
-    0 and 2: fast for low orders, slowly from order 6 on. It may not where rows of the grid differ so much
-    that averaged knots suit none of them, or where points repeat; `StandardInterpolation` always has a
-    solution.
+    0 and 2: fast for low orders, slowly from order 6 on. So that feet keep the order of their points, a foot
+    stays where it was if the closest point lies beyond the middle between its own first parameters and those
+    of its neighbours in the grid. Even so the iteration may stall where neighbouring rows of the grid differ
+    by orders of magnitude in distance or length, or where points repeat.
+
+    `Fit.stats["solved"]` tells whether the linear system gave the surface. It counts as one iteration.
 
     Examples
     --------
@@ -131,6 +144,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
     adjoint: AbstractAdjoint = UnrolledAdjoint()
     stall_window: int = 40
     stall_gain: float = 0.1
+    solve_stalled: bool = True
 
     def __check_init__(self) -> None:
         for name, kind, example in (
@@ -142,6 +156,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         ):
             check_kind(name, getattr(self, name), kind, example)
         check_method(self)
+        check_switches(self, ("local", "keep_borders", "per_point", "solve_stalled"))
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)
 
@@ -177,11 +192,14 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         far = xp.asarray(np.inf, problem.target.dtype)
         moves = self.adjoint.moves(self.freeze_after)
         path = np.full((0 if moves is None else moves + 1, 2, problem.target.shape[1]), np.nan, far.dtype)
-        return surface, GeometricState(surface, projection, far, path, xp.ones_like(far))
+        feet = xp.stack([projection.u, projection.v])
+        bounds = bounds_between(projection.u, projection.v, *surface.control_points.shape[:2])
+        return surface, GeometricState(feet, bounds, surface, projection, far, path, xp.ones_like(far))
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
-        """Closest points from the last ones."""
+        """Closest points from the last feet, which stay where a closest point is out of bounds."""
         surface = iterate.surface
+        state: GeometricState = iterate.state
         nu, nv = surface.control_points.shape[:2]
         held = corners(nu, nv).reshape(-1)
         within = side_bounds(surface.axes, nu, nv) if self.keep_borders else None
@@ -189,18 +207,20 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
             self.foot_method,
             problem,
             surface.pieces,
-            iterate.projection,
+            dataclasses.replace(iterate.projection, u=state.feet[0], v=state.feet[1]),
             self.foot_tolerance,
             held,
             within,
         )
-        state: GeometricState = iterate.state
+        feet = jnp.stack([here.u, here.v])
+        within = is_within(feet, state.bounds)
         maximum, path = jnp.max(here.error), state.path
         if path.shape[0]:
-            path = path.at[iterate.step].set(jnp.stack([here.u, here.v]), mode="drop")
+            path = path.at[iterate.step].set(jnp.where(within, feet, jnp.nan), mode="drop")
+        feet = jnp.where(within, feet, state.feet)
         parts = ((surface, here, maximum), (state.best, state.projection, state.maximum))
         *best, least = jax.tree.map(lambda x, y: lax.select(maximum < state.maximum, x, y), *parts)
-        return here, GeometricState(best[0], best[1], least, path, state.lowest)
+        return here, GeometricState(feet, state.bounds, best[0], best[1], least, path, state.lowest)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new iterate: errors may rise on the way."""
@@ -211,7 +231,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         surface, here = iterate.surface, iterate.projection
         nu, nv = surface.control_points.shape[:2]
         target = problem.target.reshape(-1, nu, nv)
-        collocation = point_collocation(surface.axes, here.u.reshape(nu, nv), here.v.reshape(nu, nv))
+        collocation = point_collocation(surface.axes, *iterate.state.feet.reshape(2, nu, nv))
         lowest = iterate.state.lowest
         weight = self.repositioning.weights(collocation, lowest)
         system = System(collocation, target, weight, corners(nu, nv), lowest, problem.diagonal)
@@ -228,10 +248,10 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
         """The best surface, if the errors have stopped falling before the end."""
-        best: GeometricState = iterate.state
-        found = (best.best, best.projection)
-        early = stopped_early & jnp.isfinite(best.maximum)
+        state: GeometricState = iterate.state
+        found = (state.best, state.projection)
+        early = stopped_early & jnp.isfinite(state.maximum)
         surface, projection = jax.tree.map(
             lambda x, y: lax.select(early, x, y), found, (iterate.surface, iterate.projection)
         )
-        return Iterate(surface, projection, best, iterate.step), {}
+        return Iterate(surface, projection, state, iterate.step), {}

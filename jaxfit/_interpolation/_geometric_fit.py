@@ -17,6 +17,7 @@ from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._adjoints import ImplicitAdjoint
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
+from jaxfit._interpolation._linear_finish import has_stalled, impatient, solved_at_grid
 from jaxfit._interpolation._method import (
     CORNERS,
     Frame,
@@ -90,7 +91,8 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
     inputs = FitInputs(
         data, start.knots, start.averaged, start.feet, frame.diagonal, frame.goal, foot_tolerance
     )
-    loop = _iterated(method, lax.stop_gradient(inputs) if not concrete else inputs, frame.max_steps, progress)
+    how = impatient(method) if concrete and method.solve_stalled else method
+    loop = _iterated(how, lax.stop_gradient(inputs) if not concrete else inputs, frame.max_steps, progress)
     end, shape = loop.current, data.shape[:2]
     net, here = end.surface.control_points, end.projection
     if symmetry is not None:
@@ -99,7 +101,7 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
     u, v = here.u.reshape(shape), here.v.reshape(shape)
     if not concrete:
         # Of the method only what plays a part, so that other choices compile nothing.
-        how = dataclasses.replace(method, symmetry=None)
+        how = dataclasses.replace(method, symmetry=None, solve_stalled=False)
         fitted = attach_derivative(how, problem.order, Fitted(net, u, v), end.state.path, inputs)
         net, u, v = fitted.net, fitted.u, fitted.v
     error, lost = (
@@ -116,8 +118,15 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
         code=loop.code,
         steps=end.step,
         unconverged_feet=lost,
-        stats={"diagonal": problem.unit.diagonal, **stats},
+        stats={"diagonal": problem.unit.diagonal, "solved": np.bool_(False), **stats},
     )
+    if concrete and method.solve_stalled and has_stalled(loop, solution.errors.max(), frame.max_steps):
+        solution = solved_at_grid(
+            problem.order, data, start.averaged, symmetry, frame, loop.history, solution
+        )
+        if progress is not None:
+            errors = float(solution.errors.mean()), float(solution.errors.max())
+            progress(int(solution.steps), int(frame.max_steps), *errors)
     return solution, frame
 
 
@@ -139,7 +148,7 @@ def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress
     xp: Any = np if concrete else jnp
     # Without derivatives no feet need to be remembered.
     adjoint = ImplicitAdjoint() if concrete else method.adjoint
-    method = dataclasses.replace(method, symmetry=None, adjoint=adjoint)
+    method = dataclasses.replace(method, symmetry=None, adjoint=adjoint, solve_stalled=False)
     target = inputs.data.reshape(-1, inputs.data.shape[2]).T
     # The net fixes the size, so points are not padded.
     ones, real = np.ones(target.shape[1], target.dtype), np.ones(target.shape[1], bool)
