@@ -7,15 +7,15 @@ from jaxtyping import Float
 
 from jaxfit._base._arc_length import along_sides
 from jaxfit._base._base_method import AbstractBaseMethod
-from jaxfit._base._held_border_fit import robust_held_fit
-from jaxfit._base._host_splines import Frame, Knots
+from jaxfit._base._held_border_fit import HeldBorderFit
+from jaxfit._base._host_splines import Knots
 from jaxfit._base._meshless_parameters import parameters_of
 from jaxfit._base._normalised_cloud import Cloud, thinned
+from jaxfit._base._unfolding import unfolded
 from jaxfit._checks import check_number
 
 FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
 STIFFENINGS = 12  # most rises of the smoothing
-UNFOLDINGS = 2  # of which so many at most because of folds where there are no points
 
 
 class Meshless(AbstractBaseMethod):
@@ -75,7 +75,7 @@ class Meshless(AbstractBaseMethod):
 
     neighbours: int = 24
     reweightings: int = 4
-    smoothing: float = 1e-5
+    smoothing: float = 0.1
     robust: int = 3
     most_points: int = 30_000
 
@@ -101,31 +101,10 @@ class Meshless(AbstractBaseMethod):
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
         most = FARTHEST * max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
-        bounded: list[np.ndarray] = []
+        fit = HeldBorderFit(net, knots, order, places, points)
         for power in range(STIFFENINGS):
             smoothing = self.smoothing * 10.0**power
-            found = robust_held_fit(net, knots, order, places, points, smoothing, self.robust)
-            if np.linalg.norm(found, axis=-1).max() > most:
-                continue
-            if not _folds_across_gaps(found, knots, order, places):
-                return found
-            bounded.append(found)
-            if len(bounded) > UNFOLDINGS:
+            found, weights = fit.robust_weights(smoothing, self.robust)
+            if np.linalg.norm(found, axis=-1).max() <= most:
                 break
-        return bounded[0] if bounded else found
-
-
-def _folds_across_gaps(
-    net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], places: Float[Any, "points 2"]
-) -> bool:
-    """Whether normals turn over where there are no points: a slack plate overshoots what its rim has."""
-    if net.shape[2] != 3:
-        return False
-    breaks = [np.unique(k) for k in knots]
-    empty = np.histogram2d(places[:, 0], places[:, 1], bins=breaks)[0] == 0
-    samples = [np.sort(np.concatenate([x[:-1] + t * np.diff(x) for t in (0.25, 0.75)])) for x in breaks]
-    normals = Frame(knots, order, *samples).normals(net)
-    there = empty.repeat(2, axis=0).repeat(2, axis=1)
-    along_u = (np.sum(normals[1:] * normals[:-1], axis=2) < 0) & there[1:] & there[:-1]
-    along_v = (np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < 0) & there[:, 1:] & there[:, :-1]
-    return bool(along_u.any() or along_v.any())
+        return unfolded(fit, found, weights, smoothing) if net.shape[2] == 3 else found
