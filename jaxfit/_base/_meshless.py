@@ -29,7 +29,13 @@ class Meshless(AbstractBaseMethod):
     those of the border stay with the boundary curves. Along the sides, parameters by chord length are taken
     over to the parameters of these curves. Parameters come from neighbours, not from a projection, so
     shapes that overhang are carried as well as flat ones: on a scanned head with ears and chin
-    the error is 0.12 % of the diagonal on average, where the Coons surface has 18 %.
+    the error is 0.14 % of the diagonal on average, where the Coons surface has 18 %.
+
+    The surface is to be regular rather than close: a fit removes the distance in a few iterations, and
+    seldom a fold. Points in cells where the normal turns by more than 72 degrees between neighbouring
+    samples (200 along each parameter), and in the cells around, lose nine tenths of their weight, then the
+    net is solved for again, up to eight times. So the smoothed surface between the other points replaces
+    what those points contradict each other about: sheets that have grown together, pockets, coarse noise.
 
     Parameters
     ----------
@@ -38,10 +44,10 @@ class Meshless(AbstractBaseMethod):
     reweightings : int
         Default 4; see `meshless_parameters`.
     smoothing : float
-        $\lambda$, as a multiple of the ratio of the traces of the two matrices (default 1e-5, at least
-        1e-10). Where there are no points, the thin plate alone decides. It is raised tenfold as long as
-        control points lie twice as far out as any point: where points crowd in a corner of the domain, a
-        slack plate would shoot out beside them; and up to twice if that removes folds across a hole.
+        $\lambda$, as a multiple of the ratio of the traces of the two matrices (default 0.1, at least
+        1e-10): details about as wide as one knot span are smoothed away. Where there are no points, the
+        thin plate alone decides. It is raised tenfold as long as control points lie twice as far out as any
+        point: where points crowd in a corner of the domain, a slack plate would shoot out beside them.
     robust : int
         Rounds in which points lose weight, $w = 1 / (1 + (r / 20 \bar r)^2)$ with r their distance and
         $\bar r$ the median (default 3), so that gross outliers have little influence.
@@ -50,11 +56,13 @@ class Meshless(AbstractBaseMethod):
 
     Notes
     -----
-    Any dimension d >= 2. Fails where `meshless_parameters` does: on a closed tube, and where two sheets are
-    closer than the points on each. Points far outside the boundary bend the surface towards them as
-    far as the border allows. The result does not depend on the order of the points nor, beyond rounding
-    and for clouds that are not thinned, on translation, rotation and scale. Takes 1 s for 6,000 points and
-    5 s for 25,000 on one core.
+    Any dimension d >= 2; weights fall at folds in three. Folds of the border itself stay. Fails where
+    `meshless_parameters` does: on a closed tube, and where two sheets are closer than the points on each
+    (there the surface is smooth, but 1 % of the diagonal and more from the points). Points far outside the
+    boundary bend the surface towards them as far as the border allows. The result does not depend on the
+    order of the points nor, beyond rounding and for clouds that are not thinned, on translation, rotation
+    and scale. Takes 1 s for 6,000 points and 5 s for 25,000 on one core, up to 25 s where noise is far coarser
+    than the points are dense.
 
     Raises
     ------
