@@ -1,10 +1,13 @@
 """Base surfaces of scanned clouds: distance of the cloud from each, and of the fits that start there.
 
-    python benchmarks/bases.py [--data FOLDER] [--max-steps N] [name ...]
+    python benchmarks/bases.py [--data FOLDER] [--max-steps N] [--spoil KIND ...] [name ...]
 
 Distances are to true closest points, in % of the diagonal of the cloud's bounding box. Fits are those of the
 default method, to the average error named or for as many iterations as allowed. `folds` are those of
-`jaxfit.regularity`: where the surface folds over, or turns more sharply than its samples show.
+`jaxfit.regularity`: where the surface folds over, or turns more sharply than its samples show. With
+`--spoil`, only meshless bases are made, of clouds with noise of 0.3 or 1 % of the diagonal, with holes, or
+with a density that falls fifty times from one side to the other; distances are those of the whole clean
+cloud.
 """
 
 import argparse
@@ -29,7 +32,34 @@ CLOUDS = {
     "blade_wrap_3000": ((24, 40), 6e-4),
     "mountain": ((42, 42), 3e-4),
 }
+SPOILT = ("noise0.3", "noise1", "holes", "uneven")
 METHODS = {"Coons": jf.Coons(), "dynamic": jf.DynamicBaseSurface(), "meshless": jf.Meshless()}
+
+
+def spoilt(points, kind):
+    """The cloud with noise, with holes of an eighth of the diagonal across, or thinned towards one side."""
+    rng, size = np.random.default_rng(0), helpers.diagonal(points)
+    if kind.startswith("noise"):
+        return points + float(kind[5:]) / 100 * size / np.sqrt(3) * rng.normal(size=points.shape)
+    if kind == "holes":
+        middles = points[rng.integers(len(points), size=4)]
+        return points[(np.linalg.norm(points[:, None] - middles, axis=2) > size / 8).all(axis=1)]
+    across = (points[:, 0] - points[:, 0].min()) / np.ptp(points[:, 0])
+    return points[rng.random(len(points)) < 50.0**-across]
+
+
+def spoilt_row(name, kind, points, boundary):
+    net, _ = CLOUDS[name]
+    given = spoilt(points, kind)
+    begun = time.perf_counter()
+    base = jf.base_surface(boundary, given, net, method=jf.Meshless())
+    seconds = time.perf_counter() - begun
+    distance = 100 / helpers.diagonal(points) * np.asarray(jf.closest_point(base, points).distance)
+    print(
+        f"{name:<16}{kind:<10}{'{} x {}'.format(*net):>8}{seconds:>7.1f}"
+        f"{distance.mean():>10.4f}{distance.max():>9.3f}{jf.regularity(base).folds:>8}",
+        flush=True,
+    )
 
 
 def row(name, label, points, boundary, max_steps, target):
@@ -58,6 +88,7 @@ def main():
     parser.add_argument(
         "--target", type=float, help="average error of all fits, as a fraction of the diagonal"
     )
+    parser.add_argument("--spoil", nargs="+", choices=SPOILT, default=[], help="what is done to the cloud")
     options = parser.parse_args()
     heads = (
         "data",
@@ -77,7 +108,9 @@ def main():
         with np.load(options.data / f"{name}.npz") as arrays:
             points = arrays["points"]
             boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
-        for label in METHODS:
+        for kind in options.spoil:
+            spoilt_row(name, kind, points, boundary)
+        for label in () if options.spoil else METHODS:
             row(name, label, points, boundary, options.max_steps, options.target)
 
 

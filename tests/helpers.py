@@ -125,6 +125,24 @@ def mean_distance(surface, points, samples=400):
     return float(cKDTree(net.reshape(-1, net.shape[-1])).query(points)[0].mean())
 
 
+def folds(surface, samples=200):
+    """Neighbours on a grid of parameters whose normals are more than 90 degrees apart, by SciPy."""
+    from scipy.interpolate import BSpline
+
+    at, steps = np.linspace(0, 1, samples), []
+    for along in (0, 1):
+        net = np.asarray(surface.control_points, float)
+        for axis, (knots, order) in enumerate(
+            zip((surface.knots_u, surface.knots_v), surface.order, strict=True)
+        ):
+            values = BSpline(np.asarray(knots, float), net, order - 1)(at, int(axis == along))
+            net = np.swapaxes(values, 0, 1)
+        steps.append(net)
+    normals = np.cross(*steps)
+    pairs = (normals[1:], normals[:-1]), (normals[:, 1:], normals[:, :-1])
+    return sum(int(np.sum(np.sum(a * b, axis=2) < 0)) for a, b in pairs)
+
+
 # ---------------------------------------------------------------- compile counts
 
 _compilations = 0

@@ -191,11 +191,48 @@ def test_a_cloud_larger_than_asked_for_is_thinned():
     assert mean_error(surface, points) < 5e-3
 
 
-def test_a_scanned_head_that_overhangs():
-    arrays = helpers.data("mannequin_head")
+@pytest.mark.parametrize("kind", ["noise", "second sheet"])
+def test_no_folds_where_points_contradict_each_other(kind):
+    points, boundary = bump(2000)
+    rng = np.random.default_rng(5)
+    if kind == "noise":  # coarser than the points are dense
+        given = points + 0.02 / np.sqrt(3) * helpers.diagonal(points) * rng.normal(size=points.shape)
+    else:
+        below = points[np.hypot(points[:, 0] - 0.5, points[:, 1] - 0.5) < 0.25] - np.array([0.0, 0.0, 0.1])
+        given = np.concatenate([points, below])
+    surface = jf.base_surface(boundary, given, (24, 24), method=jf.Meshless())
+    assert helpers.folds(surface) == 0
+    assert mean_error(surface, points) < {"noise": 5e-3, "second sheet": 6e-3}[kind]
+
+
+@pytest.mark.parametrize(
+    ("name", "net", "density", "most", "near"),
+    [
+        ("mannequin_head", (42, 42), 1.0, 10, 2e-3),
+        ("blade_wrap_3000", (24, 40), 1.0, 0, 1.2e-3),
+        ("mountain", (42, 42), 50.0, 0, 1.5e-3),
+    ],
+)
+def test_scans_that_overhang_face_themselves_or_thin_out_have_no_folds(name, net, density, most, near):
+    arrays = helpers.data(name)
     boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
-    surface = jf.base_surface(boundary, arrays["points"], (42, 42), method=jf.Meshless())
-    assert mean_error(surface, arrays["points"]) < 2e-3
+    points = arrays["points"]
+    across = (points[:, 0] - points[:, 0].min()) / np.ptp(points[:, 0])
+    kept = points[np.random.default_rng(2).random(len(points)) < density**-across]
+    surface = jf.base_surface(boundary, kept, net, method=jf.Meshless())
+    assert helpers.folds(surface) <= most
+    assert mean_error(surface, points) < near
+
+
+def test_a_fold_of_the_border_is_left_as_it_is():
+    # A side that runs back on itself: whatever the inside does, normals turn over there.
+    points, boundary = bump(600)
+    v0 = np.asarray(boundary.v0)
+    there = np.concatenate([v0[:20], v0[20:10:-1] + np.array([0.0, 0.0, 0.05]), v0[11:]])
+    folded = jf.Boundary(there, boundary.v1, boundary.u0, boundary.u1)
+    surface = jf.base_surface(folded, points, (24, 24), method=jf.Meshless())
+    assert helpers.folds(surface) > 0
+    assert mean_error(surface, points) < 2e-2
 
 
 def test_what_cannot_be_is_refused():

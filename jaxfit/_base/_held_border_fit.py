@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._host_splines import basis_matrix
+from jaxfit._base._host_splines import Knots, basis_matrix
 
 GROSS = 20.0  # times the median residual: where a point has half its weight
 LEAST = 1e-9  # of the diagonal: a residual this small is rounding
@@ -46,55 +46,62 @@ def _derivative_products(knots: np.ndarray, order: int) -> list[Any]:
     return [x.T @ x for x in rows]
 
 
-def robust_held_fit(
-    border: Float[Any, "nu nv d"],
-    knots: tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]],
-    order: tuple[int, int],
-    places: Float[Any, "points 2"],
-    points: Float[Any, "points d"],
-    smoothing: float,
-    rounds: int,
-) -> Float[Any, "nu nv d"]:
+class HeldBorderFit:
     r"""The net that minimises $\sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F$, its border as given.
 
-    F is the thin plate over the unit square; $\lambda$ is `smoothing` times the trace of the first matrix
-    over that of the second. With `smoothing` > 0 there is one solution whatever the points. The weights
-    are 1 at first, and fall with the residual over its median in each of the `rounds`.
+    F is the thin plate over the unit square; $\lambda$ is `smoothing` times the trace of the matrix of
+    the sum with all w = 1, over that of F. With `smoothing` > 0 there is one solution whatever the points.
     """
-    from scipy.interpolate import BSpline
 
-    parts = [BSpline.design_matrix(x, t, k - 1) for t, k, x in zip(knots, order, places.T, strict=True)]
-    rows, plate = _tensor_rows(*parts), _thin_plate_matrix(knots, order)
-    weights = np.ones(len(points))
-    net = _held_solution(border, rows, plate, points, weights, smoothing)
-    for _ in range(rounds):
-        residual = np.linalg.norm(rows @ net.reshape(-1, net.shape[2]) - points, axis=1)
-        usual = max(GROSS * float(np.median(residual)), LEAST)
-        weights = 1 / (1 + (residual / usual) ** 2)
-        net = _held_solution(border, rows, plate, points, weights, smoothing)
-    return net
+    def __init__(
+        self,
+        border: Float[Any, "nu nv d"],
+        knots: Knots,
+        order: tuple[int, int],
+        places: Float[Any, "points 2"],
+        points: Float[Any, "points d"],
+    ):
+        from scipy.interpolate import BSpline
 
+        parts = [BSpline.design_matrix(x, t, k - 1) for t, k, x in zip(knots, order, places.T, strict=True)]
+        self.knots, self.order, self.places, self.points = knots, order, places, points
+        self._border = border
+        self._rows, self._plate = _tensor_rows(*parts), _thin_plate_matrix(knots, order)
+        self._trace = float((self._rows.data**2).sum())
 
-def _held_solution(
-    border: np.ndarray, rows: Any, plate: Any, points: np.ndarray, weights: np.ndarray, smoothing: float
-) -> np.ndarray:
-    from scipy.sparse import diags_array
-    from scipy.sparse.linalg import splu
+    def robust_weights(
+        self, smoothing: float, rounds: int
+    ) -> tuple[Float[Any, "nu nv d"], Float[Any, " points"]]:
+        """The net and w: 1 at first, then falling with the residual over its median in each of the rounds."""
+        weights = np.ones(len(self.points))
+        net = self.net(weights, smoothing)
+        for _ in range(rounds):
+            residual = np.linalg.norm(self._rows @ net.reshape(-1, net.shape[2]) - self.points, axis=1)
+            usual = max(GROSS * float(np.median(residual)), LEAST)
+            weights = 1 / (1 + (residual / usual) ** 2)
+            net = self.net(weights, smoothing)
+        return net, weights
 
-    nu, nv, d = border.shape
-    inside = np.zeros((nu, nv), bool)
-    inside[1:-1, 1:-1] = True
-    free, held = np.flatnonzero(inside), np.flatnonzero(~inside)
-    if not len(free):
-        return border
-    normal = rows.T @ diags_array(weights) @ rows
-    trace = normal.diagonal().sum()
-    system = (normal + smoothing * trace / plate.diagonal().sum() * plate).tocsr()
-    flat = border.reshape(-1, d).copy()
-    right = (rows.T @ (weights[:, None] * points))[free] - system[free][:, held] @ flat[held]
-    # Where the plate has no bending (order 2) it leaves a control point without points undecided.
-    speck = SPECK * trace / len(flat)
-    inner = system[free][:, free] + speck * diags_array(np.ones(len(free)))
-    factors = splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    flat[free] = factors.solve(right + speck * flat[free])
-    return flat.reshape(nu, nv, d)
+    def net(self, weights: Float[Any, " points"], smoothing: float) -> Float[Any, "nu nv d"]:
+        """The minimum with these weights."""
+        from scipy.sparse import diags_array
+        from scipy.sparse.linalg import splu
+
+        nu, nv, d = self._border.shape
+        inside = np.zeros((nu, nv), bool)
+        inside[1:-1, 1:-1] = True
+        free, held = np.flatnonzero(inside), np.flatnonzero(~inside)
+        if not len(free):
+            return self._border
+        normal = self._rows.T @ diags_array(weights) @ self._rows
+        system = (normal + smoothing * self._trace / self._plate.diagonal().sum() * self._plate).tocsr()
+        flat = self._border.reshape(-1, d).copy()
+        right = (self._rows.T @ (weights[:, None] * self.points))[free] - system[free][:, held] @ flat[held]
+        # Where the plate has no bending (order 2) it leaves a control point without points undecided.
+        speck = SPECK * self._trace / len(flat)
+        inner = system[free][:, free] + speck * diags_array(np.ones(len(free)))
+        # Positive definite: no pivots off the diagonal, whose fill may cost twenty times as much.
+        options = {"SymmetricMode": True}
+        factors = splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        flat[free] = factors.solve(right + speck * flat[free])
+        return flat.reshape(nu, nv, d)

@@ -184,7 +184,9 @@ def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "node
         return nodes.fixed
     free = graph[fixed:]
     system = eye_array(count - fixed) - free[:, fixed:]
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    # An M-matrix needs no pivots off the diagonal, and those would only add fill.
+    options = {"SymmetricMode": True}
+    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     inner = factors.solve(free[:, :fixed] @ nodes.fixed)
     return np.concatenate([nodes.fixed, np.clip(inner, 0.0, 1.0)])
 

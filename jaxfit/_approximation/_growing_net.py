@@ -1,0 +1,125 @@
+"""Fits of clouds whose net grows until the tolerances are met, or until finer nets follow only noise."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._approximation._approximate import fit_cloud
+from jaxfit._approximation._errors import LocalFeet
+from jaxfit._base import Boundary, carried_base, net_of_size
+from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._splines import BSplineSurface
+
+FIRST_SIZE = 8.0  # control points along each direction of a square patch
+MOST_SIZE = 200  # control points along either direction
+GROWTH, LEAST_GROWTH = 1.5, 1.2  # of the size from one net to the next; the least where the tolerance is near
+BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
+LEVEL_STEPS = 20  # iterations with each net but the last
+LEAST_POINTS = 500  # of a cloud from which some can be held out
+HELD_OUT = 10  # one in so many points
+POINTS_A_CONTROL_POINT = 3  # at least; and of a large cloud so many times
+THINNED = 16  # of these, but never fewer than
+ENOUGH = 20_000  # points are used to choose a net
+ROOM = 32  # nets of up to so many control points share a program, then of up to twice as many, and so on
+EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
+
+
+class Level(NamedTuple):
+    """A net, its fit to a part of the points, and the average error of those held out."""
+
+    size: float
+    fit: Fit
+    held_out: float
+
+
+class NetGrowth:
+    """The levels of one cloud, from coarse to fine."""
+
+    def __init__(
+        self,
+        points: Float[np.ndarray, "points d"],
+        boundary: Boundary,
+        order: tuple[int, int],
+        method: Any,
+        request: dict[str, Any],
+    ):
+        self.points, self.boundary, self.order, self.method = points, boundary, order, method
+        self.request = request
+        given = request["weights"]
+        self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
+        self.sorted = np.lexsort(points.T)  # an even choice, whatever order the points came in
+        self.most = float(np.sqrt(len(points) / POINTS_A_CONTROL_POINT))
+
+    def net(self, size: float) -> tuple[int, int]:
+        """Control points along u and v."""
+        return net_of_size(size, self.boundary, self.order, MOST_SIZE)
+
+    def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
+        """The level to end with, and why there is none beyond it."""
+        best, before, size = None, None, FIRST_SIZE
+        while True:
+            level = self._level(size, base, before)
+            if bool(level.fit.converged):
+                return level, RESULTS.converged
+            if best is not None and not level.held_out < BETTER * best.held_out:
+                return best, RESULTS.noise_reached
+            best, size = level, size * self._growth(level.fit)
+            if size > self.most:
+                return best, RESULTS.net_exhausted
+            base, before = self.carried(level.fit.surface, size), level
+
+    def carried(self, surface: BSplineSurface, size: float) -> BSplineSurface:
+        """`surface` with another net."""
+        return carried_base(surface, self.boundary, self.net(size), self.order)
+
+    def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
+        some, held_out = self._chosen(size)
+        weights = self.weights[some]
+        same = before is not None and len(before.fit.u) == len(some)
+        request = self.request | {
+            "weights": np.where(held_out, 0.0, weights),
+            "start": (before.fit.u, before.fit.v) if before is not None and same else None,
+            "max_steps": min(LEVEL_STEPS, self.request["max_steps"]),
+            "throw": False,
+            "errors": LocalFeet(),
+        }
+        fit = fit_cloud(self.points[some], base, self.method, request, ROOM)
+        return Level(size, fit, float(np.asarray(fit.errors)[held_out & (weights > 0)].mean()))
+
+    def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
+        """The points that a net of this size is fitted to, and which of them are held out."""
+        most = ENOUGH
+        while most < THINNED * POINTS_A_CONTROL_POINT * size**2:
+            most *= 2
+        some = self.sorted[:: -(-len(self.points) // most)]
+        return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
+
+    def _growth(self, fit: Fit) -> float:
+        """How many times finer the next net is: errors fall about with the square of the size."""
+        goals = self.request["tol_average"], self.request["tol_maximum"]
+        excess = max(
+            float(error) / goal if goal else np.inf
+            for error, goal in zip((fit.average_error, fit.maximum_error), goals, strict=True)
+            if goal is not None
+        )
+        return float(np.clip(np.sqrt(excess), LEAST_GROWTH, GROWTH))
+
+
+def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
+    """The fit with a net of the size that the tolerances take, or that the points allow."""
+    level, why = growth.grown(base)
+    size, request = level.size, growth.request | {"throw": False, "start": None}
+    if why != RESULTS.converged:
+        request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
+    fit = fit_cloud(growth.points, level.fit.surface, growth.method, request, ROOM)
+    for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
+        size *= LEAST_GROWTH
+        if bool(fit.converged) or size > growth.most:
+            break
+        fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request, ROOM)
+    if not bool(fit.converged) and why != RESULTS.converged:
+        fit = dataclasses.replace(fit, result=why)
+    return converged_or_raise(fit) if growth.request["throw"] else fit

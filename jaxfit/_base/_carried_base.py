@@ -1,0 +1,46 @@
+"""A base surface with another net, from a surface that is fitted already."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._base._base_surface import base_surface
+from jaxfit._base._boundary import Boundary
+from jaxfit._base._coons import GREVILLE, coons_net
+from jaxfit._base._host_splines import Frame, Knots
+from jaxfit._splines import BSplineSurface, greville_abscissae
+
+
+def carried_base(
+    surface: BSplineSurface, boundary: Boundary, net: tuple[int, int], order: tuple[int, int]
+) -> BSplineSurface:
+    """`surface` on the knots that the boundary curves have with `net`, its sides moved onto these curves.
+
+    It is interpolated at the Greville abscissae. What the sides lack to the boundary curves is blended over
+    the inside as in (6)-(7), so that nearly the same surface with exact sides comes out.
+    """
+    sides = base_surface(boundary, net=net, order=order)
+    knots = (np.asarray(sides.knots_u, float), np.asarray(sides.knots_v, float))
+    inside = _interpolated(surface, knots, order)
+    lacking = np.asarray(sides.control_points, float) - inside
+    edges = lacking[:, 0], lacking[:, -1], lacking[0], lacking[-1]
+    moved = inside + np.asarray(coons_net(edges, *knots, GREVILLE), float)
+    for edge in ((0,), (-1,), (slice(None), 0), (slice(None), -1)):
+        moved[edge] = np.asarray(sides.control_points)[edge]
+    dtype = np.asarray(sides.control_points).dtype
+    return BSplineSurface(moved.astype(dtype), sides.knots_u, sides.knots_v)
+
+
+def _interpolated(
+    surface: BSplineSurface, knots: Knots, order: tuple[int, int]
+) -> Float[np.ndarray, "nu nv d"]:
+    """The net on these knots whose surface passes through `surface` at their Greville abscissae."""
+    from scipy.interpolate import make_interp_spline
+
+    old = (np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float))
+    places = [np.asarray(greville_abscissae(t, k), float) for t, k in zip(knots, order, strict=True)]
+    net = np.asarray(surface.control_points, float)
+    values = Frame(old, surface.order, *places).points(net)
+    for axis, (t, k, at) in enumerate(zip(knots, order, places, strict=True)):
+        values = make_interp_spline(at, values, k - 1, t=t, axis=axis).c
+        values = np.moveaxis(values, 0, axis) if axis else values
+    return values
