@@ -45,7 +45,7 @@ def test_errors_are_those_of_the_surface_cut_to_size(fit):
 
 
 def test_the_surface_is_the_same_before_and_after_an_insertion(base):
-    surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v).padded(2)
+    surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v).padded(2, 2)
     u, v = np.random.default_rng(0).random((2, 300))
     error = np.where((u > 0.6) & (v < 0.3), 1.0, 0.01)
     for _ in range(2):

@@ -99,29 +99,44 @@ def approximate(
     >>> print(fit.message)
     the maximum number of iterations was reached before the tolerances were met; ...
     """
-    method = GeometricApproximation() if method is None else method
+    request = {
+        "tol_average": tol_average,
+        "tol_maximum": tol_maximum,
+        "max_steps": max_steps,
+        "weights": weights,
+        "start": start,
+        "progress": progress,
+        "throw": throw,
+        "errors": errors,
+    }
+    return fit_cloud(points, base, default_method(method), request)
+
+
+def default_method(method: AbstractIterativeMethod | None) -> AbstractIterativeMethod:
+    """The method, or the default one for None."""
+    return GeometricApproximation() if method is None else method
+
+
+def fit_cloud(
+    points: ArrayLike,
+    base: BSplineSurface,
+    method: AbstractIterativeMethod,
+    request: dict[str, Any],
+    least: int = 0,
+) -> Fit:
+    """`approximate`, with room for a net of at least `least` control points each way, or for twice that, and
+    so on: nets of different sizes then share a program. Each iteration takes longer for it."""
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
     cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
-    unit, weight, feet = checked_request(
-        cloud,
-        base.domain,
-        method=method,
-        tol_average=tol_average,
-        tol_maximum=tol_maximum,
-        max_steps=max_steps,
-        weights=weights,
-        start=start,
-        progress=progress,
-        throw=throw,
-        errors=errors,
-    )
-    for tolerance in (tol_average, tol_maximum):
+    unit, weight, feet = checked_request(cloud, base.domain, method=method, **request)
+    goals, max_steps = (request["tol_average"], request["tol_maximum"]), request["max_steps"]
+    for tolerance in goals:
         if tolerance is not None and is_concrete(tolerance):
             advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
-    concrete = is_concrete(cloud, base, weight, start, tol_average, tol_maximum, method)
-    tolerances = _tolerances(tol_average, tol_maximum, max_steps)
+    concrete = is_concrete(cloud, base, weight, request["start"], goals, method)
+    tolerances = _tolerances(*goals, max_steps)
     problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
     begun = _working_surface(base, unit, concrete)
     if feet is None:
@@ -132,11 +147,11 @@ def approximate(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
-    loop = begin(method, together, begun, u[order], v[order], max_steps)
-    loop, stats = run(method, together, loop, progress if concrete else None)
+    loop = begin(method, together, _with_room(begun, least), u[order], v[order], max_steps)
+    loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = _fitted(loop, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
-    parts = _at_feet(errors, surface, cloud, known, method.finds_feet, concrete)
+    parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete)
     stats = {
         "method": Name(type(method).__name__),
         "num_steps": loop.current.step,
@@ -145,7 +160,7 @@ def approximate(
         **stats,
     }
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
-    return converged_or_raise(fit) if throw else fit
+    return converged_or_raise(fit) if request["throw"] else fit
 
 
 def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:
@@ -165,6 +180,14 @@ def _working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> Workin
         np.asarray(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (base.knots_u, base.knots_v)
     )
     return WorkingSurface.of(net, knots_u, knots_v)
+
+
+def _with_room(surface: WorkingSurface, least: int) -> WorkingSurface:
+    """With surplus control points up to `least`, or twice, four times, ... as many, each way."""
+    if least == 0:
+        return surface
+    sizes = surface.control_points.shape[:2]
+    return surface.padded(*((least << max(0, -(-n // least) - 1).bit_length()) - n for n in sizes))
 
 
 def _padded(x: Any, size: int, dtype: Any) -> Any:

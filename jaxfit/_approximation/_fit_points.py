@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._approximation._approximate import LEAST_POINTS, approximate
+from jaxfit._approximation._approximate import LEAST_POINTS, approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
+from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
@@ -32,8 +34,10 @@ def fit_points(
     boundary : Boundary
         The four sides of the patch.
     net : (nu, nv), optional
-        Control points along u and v. Default: about one for every eight points, shared between the
-        directions by the lengths of the sides, at least twice the order and at most 64 each.
+        Control points along u and v, shared between the directions by the lengths of the sides if not given.
+        Default: the net grows, see Notes. Where it cannot, for fewer than 500 points, a method with an
+        `insertion` of its own, a `start` or no tolerance: about one control point for every eight points,
+        at least twice the order and at most 64 each way.
     order : (K, L)
         Degree + 1 along u and v (default (4, 4)).
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
@@ -53,6 +57,16 @@ def fit_points(
     TypeError
         If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
 
+    Notes
+    -----
+    Without a `net` a coarse one is fitted to nine in ten of the points and then made up to 1.5 times finer
+    each way, again and again, each fit starting from the one before. That ends where the tolerances are met.
+    It also ends where the tenth of the points that was held out comes no nearer to the surface, by 2 % of its
+    average error, as the net gets finer: what is left is noise, and the net before is taken. And it ends
+    with three points for a control point. The last fit is one to all points. Each net takes at most
+    20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than 20,000 points as
+    many as the net needs, 48 for a control point, choose it.
+
     Examples
     --------
     >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
@@ -71,16 +85,40 @@ def fit_points(
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     checked_request(cloud, method=method, **options)
+    if net is None and _may_grow(cloud, method, options):
+        request = _DEFAULTS | options
+        growth = NetGrowth(np.asarray(cloud), boundary, order, default_method(method), request)
+        return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
+    return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
+
+
+def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int, int], base: Any) -> Any:
     if base is None and is_concrete(cloud):
-        begun = default_base(boundary, np.asarray(cloud), net, order)
-    else:
-        begun = base_surface(boundary, cloud, net=net, order=order, method=base)
-    return approximate(cloud, begun, method, **options)
+        return default_base(boundary, np.asarray(cloud), net, order)
+    return base_surface(boundary, cloud, net=net, order=order, method=base)
+
+
+def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
+    """Whether points can be held out of the fit, and nothing asks for one net."""
+    goals = [options.get(name, _DEFAULTS[name]) for name in ("tol_average", "tol_maximum")]
+    return (
+        is_concrete(cloud, options)
+        and len(cloud) >= LEAST_POINTS_TO_GROW
+        and getattr(method, "insertion", None) is None
+        and options.get("start") is None
+        and any(goal is not None for goal in goals)
+    )
+
+
+_DEFAULTS = {
+    name: parameter.default
+    for name, parameter in inspect.signature(approximate).parameters.items()
+    if name not in ("points", "base", "method")
+}
 
 
 def _check_names(options: dict[str, Any]) -> None:
-    known = list(inspect.signature(approximate).parameters)[3:]  # behind points, base and method
     for name in options:
-        if name not in known:
-            raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(known)}.")
+        if name not in _DEFAULTS:
+            raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(_DEFAULTS)}.")

@@ -72,7 +72,8 @@ def room_for(insertion: KnotInsertion | None, surface: WorkingSurface, max_steps
     """The surface with room for all knots that may be inserted within `max_steps` iterations."""
     if insertion is None:
         return surface
-    return surface.padded(min(insertion.most, int(max_steps) // insertion.every))
+    room = min(insertion.most, int(max_steps) // insertion.every)
+    return surface.padded(room, room)
 
 
 def check_insertion(insertion: Any) -> None:

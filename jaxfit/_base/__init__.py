@@ -4,12 +4,14 @@ from jaxfit._base._base_method import AbstractBaseMethod as AbstractBaseMethod
 from jaxfit._base._base_method import Coons as Coons
 from jaxfit._base._base_surface import base_surface as base_surface
 from jaxfit._base._boundary import Boundary as Boundary
+from jaxfit._base._carried_base import carried_base as carried_base
 from jaxfit._base._coons import AbstractAbscissae as AbstractAbscissae
 from jaxfit._base._coons import Greville as Greville
 from jaxfit._base._coons import Uniform as Uniform
 from jaxfit._base._coons import coons_surface as coons_surface
 from jaxfit._base._default_base import default_base as default_base
 from jaxfit._base._default_net import default_net as default_net
+from jaxfit._base._default_net import net_of_size as net_of_size
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters

@@ -27,6 +27,14 @@ class RESULTS(eqx.Enumeration):
         "the errors have stopped falling above the tolerances; loosen these, or try another method, for a "
         "cloud also more control points or a better base surface."
     )
+    noise_reached = (
+        "finer nets bring the surface no nearer to points that were held out: what is left above the "
+        "tolerances is noise, or detail between the points; loosen the tolerances."
+    )
+    net_exhausted = (
+        "the tolerances are not met with as many control points as the number of points allows; loosen them, "
+        "or pass a net or more points."
+    )
     diverged = (
         "the computation produced numbers that are not finite or errors that grow, and went back to the last "
         "good surface if there was one; check the data and the base surface."

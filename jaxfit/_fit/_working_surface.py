@@ -23,8 +23,8 @@ class WorkingSurface(eqx.Module):
     --------
     >>> net, knots_u = np.zeros((5, 3, 3)), jf.clamped_uniform_knots(5, 4)
     >>> surface = jf.WorkingSurface.of(net, np.asarray(knots_u), np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]))
-    >>> surface.order, surface.used.tolist(), surface.padded(room=2).control_points.shape
-    ((4, 3), [5, 3], (7, 5, 3))
+    >>> surface.order, surface.used.tolist(), surface.padded(2, 1).control_points.shape
+    ((4, 3), [5, 3], (7, 4, 3))
     """
 
     control_points: Float[Any, "nu nv d"]
@@ -67,13 +67,13 @@ class WorkingSurface(eqx.Module):
         """The surface with other control points and the same knots."""
         return dataclasses.replace(self, control_points=control_points)
 
-    def padded(self, room: int) -> "WorkingSurface":
-        """With `room` surplus control points in each direction."""
+    def padded(self, room_u: int, room_v: int) -> "WorkingSurface":
+        """With so many surplus control points in each direction."""
         net = self.control_points
         xp: Any = np if is_concrete(net) else jnp
-        net = xp.pad(net, ((0, room), (0, room), (0, 0)), mode="edge")
+        net = xp.pad(net, ((0, room_u), (0, room_v), (0, 0)), mode="edge")
         knots = []
-        for x in (self.knots_u, self.knots_v):
+        for x, room in ((self.knots_u, room_u), (self.knots_v, room_v)):
             yp: Any = np if is_concrete(x) else jnp
             knots.append(yp.concatenate([x, yp.repeat(x[-1:], room)]))
         wide = WorkingSurface.of(net, *knots)
