@@ -1,0 +1,93 @@
+"""fit_points without a net: it grows until the tolerances are met, or until finer nets follow only noise."""
+
+import numpy as np
+import pytest
+from helpers import diagonal
+
+import jaxfit as jf
+from jaxfit._base import carried_base
+
+COUNT = 3_000
+
+
+def height(x, y):
+    """Points of a surface with waves of two sizes."""
+    z = 0.15 * np.sin(4 * x + 0.5) * np.cos(3 * y) + 0.04 * np.sin(11 * x) * np.sin(9 * y + 1)
+    return np.stack([x, y, z], axis=-1)
+
+
+CLEAN = height(*np.random.default_rng(0).uniform(size=(2, COUNT)))
+BOUNDARY = jf.Boundary.from_grid(height(*np.meshgrid(*2 * [np.linspace(0, 1, 80)], indexing="ij")))
+
+
+@pytest.fixture(scope="module")
+def grown():
+    return jf.fit_points(CLEAN, BOUNDARY, tol_average=1e-4)
+
+
+def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
+    assert grown.converged
+    assert grown.regularity.folds == 0
+    assert float(grown.average_error) <= 1e-4
+    assert grown.errors.shape == (COUNT,)
+    assert (8, 8) < grown.surface.shape < (26, 26)
+    coarse = jf.fit_points(CLEAN, BOUNDARY, tol_average=1e-2)
+    assert coarse.converged
+    assert coarse.surface.shape == (8, 8)
+
+
+def test_the_order_of_the_points_has_no_influence(grown):
+    order = np.random.default_rng(1).permutation(COUNT)
+    other = jf.fit_points(CLEAN[order], BOUNDARY, tol_average=1e-4)
+    moved = np.asarray(other.surface.control_points) - np.asarray(grown.surface.control_points)
+    assert np.abs(moved).max() < 1e-6
+
+
+def test_noise_ends_the_growth_and_is_not_followed():
+    size, noise = diagonal(CLEAN), 0.01
+    noisy = CLEAN + noise * size / np.sqrt(3) * np.random.default_rng(2).normal(size=CLEAN.shape)
+    fit = jf.fit_points(noisy, BOUNDARY, tol_average=1e-6)
+    assert fit.result == jf.RESULTS.noise_reached
+    assert "held out" in fit.message
+    away = np.asarray(jf.closest_point(fit.surface, CLEAN).distance).mean() / size
+    fixed = [jf.fit_points(noisy, BOUNDARY, net=(n, n), tol_average=1e-6, max_steps=20) for n in (10, 24)]
+    others = [np.asarray(jf.closest_point(x.surface, CLEAN).distance).mean() / size for x in fixed]
+    assert away < 1.3 * min(others)
+    assert away < 0.4 * noise
+
+
+def test_a_tolerance_that_the_points_do_not_carry_is_reported():
+    few = CLEAN[:520]
+    fit = jf.fit_points(few, BOUNDARY, tol_average=1e-9, tol_maximum=1e-9)
+    assert fit.result in (jf.RESULTS.net_exhausted, jf.RESULTS.noise_reached)
+    assert not fit.converged
+    with pytest.raises(RuntimeError, match="tolerances"):
+        jf.fit_points(few, BOUNDARY, tol_average=1e-9, throw=True)
+
+
+def test_few_points_and_other_wishes_keep_one_net():
+    few = jf.fit_points(CLEAN[:400], BOUNDARY, tol_average=1e-3, max_steps=5)
+    assert few.surface.shape == (8, 8)
+    inserting = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=50))
+    assert jf.fit_points(CLEAN, BOUNDARY, method=inserting, max_steps=2).surface.shape == (20, 19)
+    assert jf.fit_points(CLEAN, BOUNDARY, tol_average=None).surface.shape == (20, 19)
+
+
+def test_points_of_weight_zero_choose_no_net():
+    astray = np.concatenate([CLEAN, CLEAN[::10] + [0.0, 0.0, 0.5]])
+    weights = np.concatenate([np.ones(COUNT), np.zeros(COUNT // 10)])
+    fit = jf.fit_points(astray, BOUNDARY, tol_average=1e-4, weights=weights)
+    assert fit.converged
+    assert fit.surface.shape < (26, 26)
+
+
+def test_a_surface_is_carried_to_another_net_with_the_sides_of_the_boundary():
+    coarse = jf.base_surface(BOUNDARY, net=(9, 8))
+    carried = carried_base(coarse, BOUNDARY, (20, 17), (4, 4))
+    fine = jf.base_surface(BOUNDARY, net=(20, 17))
+    assert carried.shape == (20, 17)
+    u = np.linspace(0, 1, 21)
+    for ends in ((0 * u, u), (0 * u + 1, u), (u, 0 * u), (u, 0 * u + 1)):
+        np.testing.assert_allclose(carried(*ends), fine(*ends), atol=1e-12)
+    inside = np.random.default_rng(3).uniform(size=(2, 200))
+    assert np.abs(np.asarray(carried(*inside) - fine(*inside))).max() < 0.01
