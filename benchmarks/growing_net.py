@@ -1,4 +1,4 @@
-"""`fit_points` with nothing but points, boundary and a tolerance: the net it chooses, and what it makes of noise.
+"""`fit_points` without a net: the one it chooses for a tolerance, and what it makes of noise.
 
     python benchmarks/growing_net.py [--data FOLDER] [--part tolerance noise] [name ...]
 
@@ -57,18 +57,24 @@ def shape(boundary, size):
 
 def line(name, label, fit, seconds, more=""):
     print(
-        f"{name:<16}{label:<10}{'{} x {}'.format(*fit.surface.shape):>9}{100 * float(fit.average_error):>10.4f}"
+        f"{name:<16}{label:<10}{'{} x {}'.format(*fit.surface.shape):>9}"
+        f"{100 * float(fit.average_error):>10.4f}"
         f"{100 * float(fit.maximum_error):>9.3f}{fit.regularity.folds:>7}{seconds:>8.1f}{more}",
         flush=True,
     )
 
 
-def timed(function):
-    """The result, and the seconds of a second call."""
-    function()
+def timed(points, boundary, **options):
+    """The fit, and the seconds of a second call."""
+    jf.fit_points(points, boundary, **options)
     begun = time.perf_counter()
-    result = function()
-    return result, time.perf_counter() - begun
+    fit = jf.fit_points(points, boundary, **options)
+    return fit, time.perf_counter() - begun
+
+
+def error(fit, points):
+    """Average distance of the points from the surface, in % of their diagonal."""
+    return 100 * float(np.mean(jf.closest_point(fit.surface, points).distance)) / helpers.diagonal(points)
 
 
 def tolerance_part(folder, names):
@@ -76,7 +82,7 @@ def tolerance_part(folder, names):
     for name in names or TARGETS:
         points, boundary = load(folder, name)
         goal = TARGETS[name]
-        fit, seconds = timed(lambda: jf.fit_points(points, boundary, tol_average=goal))
+        fit, seconds = timed(points, boundary, tol_average=goal)
         line(name, "grown", fit, seconds, "" if fit.converged else f"  {fit.message}")
         for size in SIZES:
             net = shape(boundary, size)
@@ -94,9 +100,6 @@ def noise_part(folder, names):
         points, boundary = load(folder, name)
         size = helpers.diagonal(points)
 
-        def error(fit):
-            return 100 * float(np.mean(jf.closest_point(fit.surface, points).distance)) / size
-
         for noise in NOISE:
             normal = np.random.default_rng(0).normal(size=points.shape)
             noisy = points + noise * size / np.sqrt(3) * normal
@@ -110,11 +113,11 @@ def noise_part(folder, names):
                 for value in SMOOTHINGS:
                     method = jf.OrthogonalDistance(smoothing=value)
                     tried = jf.approximate(noisy, base, method, tol_average=1e-6, max_steps=20)
-                    best = min(best, (error(tried), "{} x {}".format(*net), value))
+                    best = min(best, (error(tried, points), "{} x {}".format(*net), value))
             print(
-                f"{name:<16}{100 * noise:>6.1f}%{'{} x {}'.format(*fit.surface.shape):>9}{error(fit):>9.4f}"
+                f"{name:<16}{100 * noise:>6.1f}%{'{} x {}'.format(*fit.surface.shape):>9}{error(fit, points):>9.4f}"
                 f"{fit.regularity.folds:>9}{seconds:>9.1f}{best[0]:>9.4f}{best[1]:>9}{best[2]:>9.0e}"
-                f"{error(fit) / best[0]:>9.2f}",
+                f"{error(fit, points) / best[0]:>9.2f}",
                 flush=True,
             )
 

@@ -74,7 +74,7 @@ def test_few_points_and_other_wishes_keep_one_net():
 
 
 def test_points_of_weight_zero_choose_no_net():
-    astray = np.concatenate([CLEAN, CLEAN[::10] + [0.0, 0.0, 0.5]])
+    astray = np.concatenate([CLEAN, CLEAN[::10] + np.array([[0.0, 0.0, 0.5]])])
     weights = np.concatenate([np.ones(COUNT), np.zeros(COUNT // 10)])
     fit = jf.fit_points(astray, BOUNDARY, tol_average=1e-4, weights=weights)
     assert fit.converged
