@@ -115,7 +115,8 @@ def noise_part(folder, names):
                     tried = jf.approximate(noisy, base, method, tol_average=1e-6, max_steps=20)
                     best = min(best, (error(tried, points), "{} x {}".format(*net), value))
             print(
-                f"{name:<16}{100 * noise:>6.1f}%{'{} x {}'.format(*fit.surface.shape):>9}{error(fit, points):>9.4f}"
+                f"{name:<16}{100 * noise:>6.1f}%{'{} x {}'.format(*fit.surface.shape):>9}"
+                f"{error(fit, points):>9.4f}"
                 f"{fit.regularity.folds:>9}{seconds:>9.1f}{best[0]:>9.4f}{best[1]:>9}{best[2]:>9.0e}"
                 f"{error(fit, points) / best[0]:>9.2f}",
                 flush=True,
