@@ -61,7 +61,7 @@ class Meshless(AbstractBaseMethod):
     (there the surface is smooth, but 1 % of the diagonal and more from the points). Points far outside the
     boundary bend the surface towards them as far as the border allows. The result does not depend on the
     order of the points nor, beyond rounding and for clouds that are not thinned, on translation, rotation
-    and scale. Takes 1 s for 6,000 points and 5 s for 25,000 on one core, up to 25 s where noise is far
+    and scale. Takes 1 s for 6,000 points and 5 s for 25,000 on one core, several times as long where noise is
     coarser than the points are dense.
 
     Raises

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from jaxfit._base._held_border_fit import HeldBorderFit
 from jaxfit._base._host_splines import Frame, Knots
 
-TURN = 0.3  # cosine of the angle between neighbouring normals where a fold begins; sharp edges have more
+TURN = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
 SAMPLES = 200  # at least so many in all along u and along v,
 IN_A_CELL = 4  # and in every cell
 LOSS = 0.1  # what is left of the weight of a point near a fold, each time
@@ -32,33 +32,34 @@ def unfolded(
         for x, places in zip(breaks, fit.places.T, strict=True)
     ]
     reach = np.zeros([len(x) - 1 for x in breaks], int)
-    best, fewest, idle = net, np.inf, 0
+    cells, count = folds(net, fit.knots, fit.order)
+    best, fewest, idle = net, count, 0
     for _ in range(ROUNDS):
-        cells, count = folds(net, fit.knots, fit.order)
-        idle = 0 if count < fewest else idle + 1
-        if count < fewest:
-            best, fewest = net, count
         if count == 0 or idle == IDLE:
             break
         reach += cells
         near = _surroundings(np.where(cells, reach, 0))
         weights = np.where(near[inside[0], inside[1]], LOSS * weights, weights)
         net = fit.net(weights, smoothing)
-    return best if folds(net, fit.knots, fit.order)[1] >= fewest else net
+        cells, count = folds(net, fit.knots, fit.order)
+        idle = 0 if count < fewest else idle + 1
+        if count < fewest:
+            best, fewest = net, count
+    return best
 
 
 def folds(
     net: Float[Any, "nu nv 3"], knots: Knots, order: tuple[int, int]
 ) -> tuple[Bool[Any, "cells_u cells_v"], int]:
-    """The cells between which or in which the normal turns over, and how many neighbours it does between."""
+    """The cells where the normal turns too far between neighbouring samples, and how many pairs there are."""
     breaks = [np.unique(t) for t in knots]
     samples, cell = zip(*(_samples(x) for x in breaks), strict=True)
     normals = Frame(knots, order, *samples).normals(net)
     cells = np.zeros([len(x) - 1 for x in breaks], bool)
     along_u = np.argwhere(np.sum(normals[1:] * normals[:-1], axis=2) < TURN)
     along_v = np.argwhere(np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < TURN)
-    for first, step in ((along_u, (1, 0)), (along_v, (0, 1))):
-        for i, j in (first.T, (first + step).T):
+    for pairs, step in ((along_u, (1, 0)), (along_v, (0, 1))):
+        for i, j in (pairs.T, (pairs + step).T):
             cells[cell[0][i], cell[1][j]] = True
     return cells, len(along_u) + len(along_v)
 
