@@ -224,6 +224,14 @@ def test_scans_that_overhang_face_themselves_or_thin_out_have_no_folds(name, net
     assert mean_error(surface, points) < near
 
 
+def test_a_sharp_edge_is_no_fold_to_an_order_of_two():
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 41), np.linspace(0, 1, 41), indexing="ij")
+    roof = np.stack([0.6 * x, y, -0.8 * np.abs(x)], axis=2)  # the normal turns by 106 degrees
+    boundary, points = jf.Boundary.from_grid(roof), roof[1:-1, 1:-1].reshape(-1, 3)
+    surface = jf.base_surface(boundary, points, (15, 15), (2, 2), method=jf.Meshless())
+    assert mean_error(surface, points) < 3.2e-3
+
+
 def test_a_fold_of_the_border_is_left_as_it_is():
     # A side that runs back on itself: whatever the inside does, normals turn over there.
     points, boundary = bump(600)

@@ -9,6 +9,7 @@ from jaxfit._base._held_border_fit import HeldBorderFit
 from jaxfit._base._host_splines import Frame, Knots
 
 TURN = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
+CREASED = -0.8  # the same for order 2, whose surfaces may have sharp edges at all knots
 SAMPLES = 200  # at least so many in all along u and along v,
 IN_A_CELL = 4  # and in every cell
 LOSS = 0.1  # what is left of the weight of a point near a fold, each time
@@ -56,8 +57,9 @@ def folds(
     samples, cell = zip(*(_samples(x) for x in breaks), strict=True)
     normals = Frame(knots, order, *samples).normals(net)
     cells = np.zeros([len(x) - 1 for x in breaks], bool)
-    along_u = np.argwhere(np.sum(normals[1:] * normals[:-1], axis=2) < TURN)
-    along_v = np.argwhere(np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < TURN)
+    turn_u, turn_v = (CREASED if k == 2 else TURN for k in order)
+    along_u = np.argwhere(np.sum(normals[1:] * normals[:-1], axis=2) < turn_u)
+    along_v = np.argwhere(np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < turn_v)
     for pairs, step in ((along_u, (1, 0)), (along_v, (0, 1))):
         for i, j in (pairs.T, (pairs + step).T):
             cells[cell[0][i], cell[1][j]] = True
