@@ -27,6 +27,7 @@ def fits(monkeypatch):
             u, v = np.random.default_rng(0).uniform(size=(2, count))
             return SimpleNamespace(
                 surface=wavy_surface(),
+                regularity=jaxfit.regularity(wavy_surface()),
                 u=u,
                 v=v,
                 errors=np.full(count, calls.average),

@@ -108,6 +108,7 @@ def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
         and getattr(method, "insertion", None) is None
         and options.get("start") is None
         and any(goal is not None for goal in goals)
+        and options.get("max_steps") != 0
     )
 
 
