@@ -35,7 +35,7 @@ def fits(monkeypatch):
                 maximum_error=calls.maximum,
                 converged=calls.converged,
                 message="The errors are within their tolerances.",
-                stats={"num_steps": 3},
+                stats={"num_steps": 3, "diagonal": 1.0},
             )
 
         return fit
