@@ -1,4 +1,4 @@
-"""A wall between parts of a computation that XLA may not fuse through."""
+"""`materialise`: a barrier that keeps XLA from fusing parts of a computation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ def materialise(always: Array, function: Callable[..., Any], *args: Any) -> Any:
 
     XLA's CPU compiler copies an expression into each of its uses, which multiplies the work where one
     large expression has many; an optimisation barrier is dropped before that happens. A branch on a value
-    known only at run time is a wall that stays. `always` is that value: true, but not provably so.
+    known only at run time is a barrier that stays. `always` is that value: true, but not provably so.
     """
     shapes = jax.eval_shape(function, *args)
 

@@ -13,5 +13,5 @@ from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._iterate_feet import PointSums as PointSums
 from jaxfit._closest._nearest_feet import HostFeet as HostFeet
 from jaxfit._closest._nearest_feet import nearest_feet as nearest_feet
-from jaxfit._closest._project import Border as Border
+from jaxfit._closest._project import ParameterBounds as ParameterBounds
 from jaxfit._closest._project import project as project

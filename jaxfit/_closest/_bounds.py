@@ -1,4 +1,4 @@
-"""Where feet may go, and the local coordinates of the cells they are in."""
+"""Bounds on the parameters of feet, and the local coordinates of their cells."""
 
 from typing import NamedTuple
 
@@ -54,20 +54,20 @@ def bounds_of_cells(pieces: Pieces, third: Float[Array, " cells"]) -> Float[Arra
 
 
 def bounds_of_slots(
-    cells: Float[Array, "cells 11"], part: Rows, border: Float[Array, "2 2 _"] | None
+    cells: Float[Array, "cells 11"], part: Rows, within: Float[Array, "2 2 _"] | None
 ) -> tuple[Bounds, Float[Array, "1 1 slots"]]:
     """The entries of `bounds_of_cells` for the slots of some rows, in one line.
 
-    `border` are narrower bounds (lower and upper, u and v), of all points or of each.
+    `within` are narrower bounds (lower and upper, u and v), of all points or of each.
     """
     rows, width = part.point.shape
     wide = jnp.broadcast_to(take(cells, part.cell, 0).T[..., None], (11, rows, width)).reshape(11, 1, -1)
     *pairs, third = lax.split(wide, (2, 2, 2, 2, 2, 1))
     bounds = Bounds(*pairs)
-    if border is not None:
-        if border.shape[2] > 1:
-            border = part.spread(border.reshape(4, -1)).reshape(2, 2, -1)
-        low, high = jnp.maximum(bounds.low, border[0][:, None]), jnp.minimum(bounds.high, border[1][:, None])
+    if within is not None:
+        if within.shape[2] > 1:
+            within = part.spread(within.reshape(4, -1)).reshape(2, 2, -1)
+        low, high = jnp.maximum(bounds.low, within[0][:, None]), jnp.minimum(bounds.high, within[1][:, None])
         bounds = bounds._replace(low=low, high=high)
     return bounds, third
 
@@ -75,12 +75,12 @@ def bounds_of_slots(
 def active_bounds(
     forms: Forms, x: Float[Array, "2 1 slots"], bounds: Bounds, tolerance: Float[Array, ""]
 ) -> tuple[Bool[Array, "2 1 slots"], Bool[Array, "1 1 slots"]]:
-    """Which coordinates are held at a bound by the gradient, and whether the free ones are settled.
+    """Which bounds are active by the sign of the gradient, and whether the free coordinates have converged.
 
-    Settled: the residual's components along the free tangents, lengths, are below the tolerance.
+    Converged: the components of the residual along the free tangents, lengths, are below the tolerance.
     """
     g, square = forms.gradient, tolerance**2
     # Moving along a tangent so short changes nothing: curves along v, poles.
     fixed = (bounds.high <= bounds.low) | (forms.metric <= square)
-    pinned = fixed | lax.select(g < 0, x <= bounds.low, x >= bounds.high)
-    return pinned, both(pinned | (g * g <= square * forms.metric))
+    active = fixed | lax.select(g < 0, x <= bounds.low, x >= bounds.high)
+    return active, both(active | (g * g <= square * forms.metric))

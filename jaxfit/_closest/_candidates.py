@@ -55,7 +55,7 @@ class Search:
         row, column = np.divmod(index, self.along_v.u.size)
         return self.along_u.u[row], self.along_v.u[column]
 
-    def elsewhere(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray, which: np.ndarray) -> np.ndarray:
+    def are_apart(self, sample: np.ndarray, u: np.ndarray, v: np.ndarray, which: np.ndarray) -> np.ndarray:
         """Which samples, each for the foot (u, v) with the number `which`, do not lie beside it."""
         row, column = np.divmod(sample, self.along_v.u.size)
         apart = self.along_u.apart(row, u, which) | self.along_v.apart(column, v, which)
@@ -71,13 +71,13 @@ class Search:
 
     def candidates(
         self, points: Float[np.ndarray, "points d"], u: np.ndarray, v: np.ndarray, distance: np.ndarray
-    ) -> "Candidates":
+    ) -> "StartCandidates":
         """The samples that may lead to a foot nearer to the points than those at (u, v)."""
         parts = [slice(begin, begin + BLOCK) for begin in range(0, len(distance), BLOCK)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             found = list(pool.map(lambda part: self._candidates_of(part, points, u, v, distance), parts))
         who, sample = (np.concatenate(x) for x in zip(*found, strict=True))
-        return Candidates(self, points, who, sample)
+        return StartCandidates(self, points, who, sample)
 
     def _candidates_of(
         self, part: slice, points: np.ndarray, u: np.ndarray, v: np.ndarray, distance: np.ndarray
@@ -95,7 +95,7 @@ class Search:
                 open_ &= ~crowded
             row, column = np.nonzero(open_)
             there = index[row, column]
-            apart = self.elsewhere(there, u[which], v[which], column)
+            apart = self.are_apart(there, u[which], v[which], column)
             who.append(which[column[apart]])
             sample.append(there[apart])
             which = which[crowded]
@@ -156,7 +156,7 @@ class _Direction:
         return apart
 
 
-class Candidates:
+class StartCandidates:
     """Pairs (point, sample) still to be tried, grouped by point, the most promising first."""
 
     def __init__(self, search: Search, points: np.ndarray, who: np.ndarray, sample: np.ndarray):
@@ -175,7 +175,7 @@ class Candidates:
 
     def found(self, u: np.ndarray, v: np.ndarray) -> None:
         """Drop the samples beside the feet at (u, v), which are given for all points."""
-        self._keep(self.search.elsewhere(self.sample, u, v, self.who))
+        self._keep(self.search.are_apart(self.sample, u, v, self.who))
 
     def first(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """One start for each point that has any, taken off the list."""

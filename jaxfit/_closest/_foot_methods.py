@@ -22,20 +22,20 @@ LEAST_EIGENVALUE = 1e-3
 TRUSTED_SHARE = 0.5
 
 Step = Float[Array, "2 1 slots"]
-Pinned = Bool[Array, "2 1 slots"]
+Active = Bool[Array, "2 1 slots"]
 
 
 class AbstractFootMethod(eqx.Module):
     """How a foot point moves, given the inner products at it."""
 
-    drift: AbstractClassVar[bool]  # whether `step` needs Forms.drift
-    quadratic: AbstractClassVar[bool]  # whether steps shrink quadratically at a foot
+    needs_christoffel: AbstractClassVar[bool]  # whether `step` uses `Forms.christoffel`
+    converges_quadratically: AbstractClassVar[bool]  # whether steps shrink quadratically at a foot
 
     @abstractmethod
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
-        """The step in local coordinates; a pinned coordinate does not move.
+    def step(self, forms: Forms, active: Active, fall_back: Bool[Array, "1 1 slots"]) -> Step:
+        """The step in local coordinates; a coordinate at an `active` bound does not move.
 
-        Where it is `late`, a method that converges linearly takes a Newton step.
+        Where `fall_back` holds, a method that converges linearly takes a Newton step.
         """
 
 
@@ -51,22 +51,22 @@ class Newton(AbstractFootMethod):
     Newton()
     """
 
-    drift: ClassVar[bool] = False
-    quadratic: ClassVar[bool] = True
+    needs_christoffel: ClassVar[bool] = False
+    converges_quadratically: ClassVar[bool] = True
 
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
+    def step(self, forms: Forms, active: Active, fall_back: Bool[Array, "1 1 slots"]) -> Step:
         """Solve the 2x2 system with the Hessian, made positive where it is not."""
         metric, (diagonal, mixed) = forms.metric, forms.hessian
         # Its eigenvalues against the first form are 1 - curvature * distance; lift a negative one.
-        area = product(metric) - forms.skew * forms.skew
-        trace = total(diagonal * lax.rev(metric, (0,))) - 2.0 * mixed * forms.skew
+        area = product(metric) - forms.metric_mixed * forms.metric_mixed
+        trace = total(diagonal * lax.rev(metric, (0,))) - 2.0 * mixed * forms.metric_mixed
         root = jnp.sqrt(jnp.maximum(trace * trace - 4.0 * (product(diagonal) - mixed * mixed) * area, 0.0))
         lowest = _divide(trace - root, 2.0 * area)
         doubtful = lowest < _tiny_angle(lowest) ** 0.5
         lift = jnp.where(doubtful, jnp.abs(lowest) - lowest + LEAST_EIGENVALUE, 0.0)
         single = jnp.maximum(jnp.abs(diagonal), LEAST_EIGENVALUE * metric)
-        diagonal = lax.select(lax.rev(pinned, (0,)), single, diagonal + lift * metric)
-        return _solve(forms, diagonal, mixed + lift * forms.skew, pinned)
+        diagonal = lax.select(lax.rev(active, (0,)), single, diagonal + lift * metric)
+        return _solve(forms, diagonal, mixed + lift * forms.metric_mixed, active)
 
 
 class HuWallner(AbstractFootMethod):
@@ -84,44 +84,46 @@ class HuWallner(AbstractFootMethod):
     HuWallner()
     """
 
-    drift: ClassVar[bool] = True
-    quadratic: ClassVar[bool] = False
+    needs_christoffel: ClassVar[bool] = True
+    converges_quadratically: ClassVar[bool] = False
 
-    def step(self, forms: Forms, pinned: Pinned, late: Bool[Array, "1 1 slots"]) -> Step:
+    def step(self, forms: Forms, active: Active, fall_back: Bool[Array, "1 1 slots"]) -> Step:
         """Tangent-plane step, scaled to the foot on the circle of curvature."""
-        plane = _solve(forms, forms.metric, forms.skew, pinned)
+        plane = _solve(forms, forms.metric, forms.metric_mixed, active)
         factor, trusted = self._factor(forms, plane)
-        circle = jnp.broadcast_to(trusted & ~late, plane.shape)
-        return lax.select(circle, factor * plane, Newton().step(forms, pinned, late))
+        circle = jnp.broadcast_to(trusted & ~fall_back, plane.shape)
+        return lax.select(circle, factor * plane, Newton().step(forms, active, fall_back))
 
     def _factor(self, forms: Forms, step: Step) -> tuple[Array, Array]:
         """What the tangent-plane step is multiplied by, and where that can be trusted."""
-        assert forms.drift is not None
+        assert forms.christoffel is not None
         # Weights of the second derivative along the step: ss, tt, st.
         weight = jnp.concatenate([step * step, 2.0 * product(step)])
-        length2 = total(weight * jnp.concatenate([forms.metric, forms.skew]))
+        length2 = total(weight * jnp.concatenate([forms.metric, forms.metric_mixed]))
         height2 = forms.f - 2.0 * total(step * forms.gradient) + length2
-        along = step[:1] * total(weight * forms.drift[0]) + step[1:] * total(weight * forms.drift[1])
-        above = total(weight * forms.bend) - along
-        bend = _divide(above, length2)  # curvature times height
+        along = step[:1] * total(weight * forms.christoffel[0]) + step[1:] * total(
+            weight * forms.christoffel[1]
+        )
+        above = total(weight * forms.second_form) - along
+        curvature_height = _divide(above, length2)  # 1 at the centre of curvature
         # tan(angle on the circle) = curvature * tangential distance / (1 - curvature * height)
         turn2 = _divide(_divide(above * above, length2), height2)
-        remaining = 1.0 - bend
+        remaining = 1.0 - curvature_height
         shrink = lax.rsqrt(jnp.maximum(remaining * remaining + turn2, jnp.finfo(step.dtype).tiny))
         # The section advances by x + (along / length2) x^2 / 2 in its tangent's direction.
         factor = shrink * (1.0 - 0.5 * _divide(along, length2) * shrink)
         # Near the centre of curvature the circle's foot jumps, and the direction is no longer right.
-        return factor, bend <= TRUSTED_SHARE
+        return factor, curvature_height <= TRUSTED_SHARE
 
 
-def _solve(forms: Forms, diagonal: Array, mixed: Array, pinned: Pinned) -> Step:
+def _solve(forms: Forms, diagonal: Array, mixed: Array, active: Active) -> Step:
     """Solve the 2x2 systems for the step of the free coordinates; the others do not move.
 
     Where the tangents are parallel, along the axes. As few divisions as can be, for they take the time.
     """
-    gradient = jnp.where(pinned, 0.0, forms.gradient)
-    # A pinned coordinate's own equation becomes that of the identity.
-    diagonal, alone = jnp.where(pinned, 1.0, diagonal), either(pinned)
+    gradient = jnp.where(active, 0.0, forms.gradient)
+    # The equation of a coordinate at an active bound becomes that of the identity.
+    diagonal, alone = jnp.where(active, 1.0, diagonal), either(active)
     mixed = jnp.where(alone, 0.0, mixed)
     determinant = product(diagonal) - mixed * mixed
     least = jnp.where(alone, 0.0, _tiny_angle(mixed) * product(forms.metric))

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._closest._feet import FOUND, SUMMED_FOUND, Limits
 from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._foot_states import FOUND, SUMMED_FOUND, FootLimits
 from jaxfit._closest._iterate_feet import PointSums, iterate_feet
-from jaxfit._closest._project import Border, in_precision_of, initial_feet
+from jaxfit._closest._project import ParameterBounds, in_precision_of, initial_feet
 from jaxfit._splines._pieces import Pieces
 
 MAX_STEPS = 40
@@ -37,7 +37,7 @@ def update_feet(
     idle: Bool[Array, " points"],
     max_steps: Any = MAX_STEPS,
     single_step: Any = False,
-    within: Border | None = None,
+    within: ParameterBounds | None = None,
     sums: PointSums | None = None,
     weight: Float[Array, " points"] | None = None,
 ) -> tuple[FootUpdate, Any]:
@@ -63,9 +63,9 @@ def update_feet(
     ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
     pieces = in_precision_of(target, pieces)
-    limits = Limits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
+    limits = FootLimits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     done = FOUND if sums is None else SUMMED_FOUND
     feet, bounds = initial_feet(pieces, u, v, idle, within, done)
     feet, found = iterate_feet(method, pieces, target, feet, limits, bounds, sums, weight, single_step)
-    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.best)))
+    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.squared_distance)))
     return FootUpdate(feet.best_u, feet.best_v, error, feet.steps, feet.converged), found

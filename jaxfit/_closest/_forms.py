@@ -1,7 +1,7 @@
-"""Inner products of the residual and the derivatives at a foot, which every step is made of.
+"""Inner products of the residual and the derivatives at a foot, from which every step is computed.
 
-Vectors are arrays (k, d, slots), numbers (k, 1, slots), with k = 2 for what belongs to both parameters: so an
-operation serves both, and nothing is reshaped.
+Vectors are arrays (k, d, slots), numbers (k, 1, slots), with k = 2 for what belongs to both parameters. One
+operation then serves both parameters, and nothing is reshaped.
 """
 
 from functools import reduce
@@ -28,16 +28,17 @@ class Forms(eqx.Module):
     """Inner products at the current feet."""
 
     f: Float[Array, "1 1 slots"]  # squared distance e . e
-    gradient: Float[Array, "2 1 slots"]  # e . R_s and e . R_t, half the fall of f
+    gradient: Float[Array, "2 1 slots"]  # e . R_s and e . R_t: minus half the gradient of f
     metric: Float[Array, "2 1 slots"]  # E and G of the first fundamental form
-    skew: Float[Array, "1 1 slots"]  # F of the first fundamental form
-    bend: Float[Array, "3 1 slots"]  # e . R_ss, e . R_tt, e . R_st
-    drift: Float[Array, "2 3 1 slots"] | None = None  # second times first derivatives, where a method asks
+    metric_mixed: Float[Array, "1 1 slots"]  # F of the first fundamental form
+    second_form: Float[Array, "3 1 slots"]  # e . R_ss, e . R_tt, e . R_st: L, N and M times the distance
+    # Christoffel symbols of the first kind, R_ss, R_tt and R_st times R_s and R_t, if a method needs them.
+    christoffel: Float[Array, "2 3 1 slots"] | None = None
 
     @property
     def hessian(self) -> tuple[Float[Array, "2 1 slots"], Float[Array, "1 1 slots"]]:
         """Diagonal and off-diagonal entry of the Hessian of f / 2."""
-        return self.metric - self.bend[:2], self.skew - self.bend[2:]
+        return self.metric - self.second_form[:2], self.metric_mixed - self.second_form[2:]
 
 
 def expand(
@@ -53,16 +54,16 @@ def expand(
     return Expansion(target - value, jnp.concatenate([s, t]), jnp.concatenate([ss, tt, st]))
 
 
-def inner_products(at: Expansion, drift: bool) -> Forms:
-    """All inner products; with `drift` those that Hu and Wallner's step needs besides."""
+def inner_products(at: Expansion, christoffel: bool) -> Forms:
+    """All inner products, the Christoffel symbols only if asked for."""
     e, first, second = at.e, at.first, at.second
     return Forms(
         f=inner(e, e),
         gradient=inner(e, first),
         metric=inner(first, first),
-        skew=inner(first[:1], first[1:]),
-        bend=inner(e, second),
-        drift=jnp.stack([inner(second, x) for x in (first[:1], first[1:])]) if drift else None,
+        metric_mixed=inner(first[:1], first[1:]),
+        second_form=inner(e, second),
+        christoffel=jnp.stack([inner(second, x) for x in (first[:1], first[1:])]) if christoffel else None,
     )
 
 

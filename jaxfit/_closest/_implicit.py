@@ -1,8 +1,8 @@
-"""Feet as a differentiable function: the implicit derivative of the two orthogonality equations.
+"""The derivative of foot points, by the implicit function theorem.
 
-At a foot g = ((Q - R).R_u, (Q - R).R_v) vanishes, and g's derivative in (u, v) is minus the Hessian H of
-half the squared distance. So d(u, v) = H^-1 dg, dg being taken at fixed (u, v). A coordinate held at a
-border or on a crease does not move; where H is singular nothing moves, so that nothing is ever NaN.
+At a foot g = ((Q - R).R_u, (Q - R).R_v) vanishes, and the derivative of g in (u, v) is -H, H being the
+Hessian of half the squared distance. So d(u, v) = H^-1 dg, with dg taken at fixed (u, v). Coordinates at an
+active bound or on a crease have the derivative 0, and so have feet with a singular H: no derivative is NaN.
 """
 
 from functools import partial
@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._closest._foot_methods import AbstractFootMethod
-from jaxfit._closest._project import Border, project
+from jaxfit._closest._project import ParameterBounds, project
 from jaxfit._closest._samples import best_samples, sample_points
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import make_pieces
@@ -36,7 +36,9 @@ def foot_parameters(
     """(u, v, converged, steps); from `start`, or from the two best of a dense sample without one."""
     fixed = lax.stop_gradient((surface, points, start, tolerance, max_steps))
     search = partial(_found, method)
-    if jax.default_backend() == "cpu":  # a batch one by one: at once, every branch would be taken for all
+    if (
+        jax.default_backend() == "cpu"
+    ):  # a batch one by one: an ordinary vmap would compute both branches of every condition
         search = jax.custom_batching.sequential_vmap(search)
     u, v, converged, steps = search(*fixed)
     u, v = as_feet((u, v), surface, points, tolerance)
@@ -63,7 +65,7 @@ def _found(
     u, v = best_samples(jnp.asarray(samples[0]), jnp.asarray(samples[1]), jnp.asarray(samples[2]), target)
     twice = jnp.concatenate([target, target], axis=1)
     feet = project(method, pieces, twice, u.reshape(-1), v.reshape(-1), tolerance, max_steps)
-    second = feet.best[count:] < feet.best[:count]
+    second = feet.squared_distance[count:] < feet.squared_distance[:count]
 
     def nearer(x: Array) -> Array:
         return jnp.where(second, x[count:], x[:count])
@@ -77,7 +79,7 @@ def as_feet(
     surface: Arrays,
     points: Float[Array, "points d"],
     tolerance: Array,
-    within: Border | None = None,
+    within: ParameterBounds | None = None,
 ) -> tuple[Array, Array]:
     """The parameters `feet` (u, v) of `points`, known to be feet, as functions of surface and points.
 
@@ -110,7 +112,7 @@ def _as_feet_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def foot_change(
-    feet: Any, slopes: Any, form: Any, hessian: Any, changes: Any, within: Border, tolerance: Array
+    feet: Any, slopes: Any, form: Any, hessian: Any, changes: Any, within: ParameterBounds, tolerance: Array
 ) -> tuple[Array, Array]:
     """How feet follow a change of their `slopes` (g_u, g_v) at held parameters.
 
@@ -129,7 +131,7 @@ def _ends(knots: Array, order: int) -> tuple[Array, Array]:
 
 
 def _free(u: Array, g: Array, E: Array, low: Array, high: Array, tolerance: Array) -> Array:
-    """Whether a coordinate moves: not held, nor pushed against a border, nor, on a crease, off balance."""
+    """Whether a coordinate has a derivative: at no active bound, and with g = 0, unlike on a crease."""
     pushed = ((u <= low) & (g < 0)) | ((u >= high) & (g > 0)) | (low >= high)
     scale = jnp.sqrt(jnp.finfo(u.dtype).eps)
     balanced = g * g <= (100.0 * tolerance) ** 2 * E + scale * jnp.finfo(u.dtype).tiny

@@ -78,7 +78,7 @@ def _run(
     return {
         "u": feet.best_u,
         "v": feet.best_v,
-        "f": feet.best,
+        "f": feet.squared_distance,
         "converged": feet.converged,
         "steps": feet.steps,
         "point": values_at(pieces, feet.best_u, feet.best_v),
@@ -149,7 +149,7 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
     # The reach is that of a surface in space whose tangent plane nowhere jumps.
     smooth = not (axes[0].creased or axes[1].creased) and axes[1].polynomials.shape[1] > 1
     if smooth and net.shape[2] == 3 and len(points) >= LEAST_POINTS_PER_CELL * axes[0].cells * axes[1].cells:
-        below = Reach(net, *axes).covers(best["u"], best["v"], np.sqrt(best["f"]))
+        below = Reach(net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
         left = np.flatnonzero(~(below & best["converged"]))
     if left.size:
         search = search or Search(sample(net.astype(projector.dtype), *axes))

@@ -59,8 +59,8 @@ class Reach:
         self.forms = E, F, G
         self.tree = KDTree(self.points.T, LEAF, balanced_tree=False, compact_nodes=False)
 
-    def covers(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
-        """Whether the feet at (u, v), `distance` away from their points, lie below the reach."""
+    def exceeds(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
+        """Whether the reach at the feet (u, v) exceeds their `distance` from their points."""
         a, b = self.shape
         row, column = (
             _interval(axis, x, count - 1) for axis, x, count in zip(self.axes, (u, v), (a, b), strict=True)

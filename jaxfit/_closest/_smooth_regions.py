@@ -1,4 +1,4 @@
-"""Feet on creases: one that has been found there tries the smooth regions on its other sides.
+"""Feet on creases: a foot found on a crease also tries the smooth regions on the other sides.
 
 A smooth region is what lies between neighbouring creases, in both directions. A foot stays within its own
 until it finds a nearer foot across a crease.
@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxfit._cells import take
-from jaxfit._closest._feet import FOUND, GOING, Feet, Limits
+from jaxfit._closest._foot_states import FOUND, GOING, FootLimits, FootStates
 from jaxfit._splines._pieces import Axis, Pieces
 
 LAST_TRY = 3
@@ -19,7 +19,7 @@ LAST_TRY = 3
 class SmoothRegion(eqx.Module):
     """The smooth region of every foot, given by a cell in it, and those across the creases in u and in v.
 
-    Bit 0 of `tries` says that the foot now looks across the crease in u, bit 1 across that in v.
+    Bit 0 of `tries` says that the foot is now searched across the crease in u, bit 1 across that in v.
     """
 
     base: Int[Array, "2 points"]
@@ -33,7 +33,7 @@ class SmoothRegion(eqx.Module):
         return jnp.where((self.tries & jnp.asarray([[1], [2]], jnp.int32)) > 0, self.across, self.base)
 
 
-def initial_region(pieces: Pieces, feet: Feet) -> SmoothRegion:
+def initial_region(pieces: Pieces, feet: FootStates) -> SmoothRegion:
     """Every foot in the region it starts from."""
     u, v = feet.trial
     cell = jnp.stack([pieces.axis_u.locate(u), pieces.axis_v.locate(v)])
@@ -48,11 +48,11 @@ def cells_of_regions(pieces: Pieces, region: SmoothRegion, cell_u: Array, cell_v
 
 
 def cross_creases(
-    pieces: Pieces, old: Feet, new: Feet, region: SmoothRegion, limits: Limits
-) -> tuple[Feet, SmoothRegion]:
-    """Send feet that have just been found on a crease to look across it; the rest stay as they are."""
+    pieces: Pieces, old: FootStates, new: FootStates, region: SmoothRegion, limits: FootLimits
+) -> tuple[FootStates, SmoothRegion]:
+    """Feet that have just been found on a crease are searched across it; the others do not change."""
     found, best = ((new.state == FOUND) & (old.state == GOING))[None], new.parts[4:5]
-    begins = (region.tries == 0) | (best < region.before - limits.slack(best))
+    begins = (region.tries == 0) | (best < region.before - limits.rounding_of(best))
     cell, axes = region.cell, (pieces.axis_u, pieces.axis_v)
     sides = [_across(a, x, mine) for a, x, mine in zip(axes, new.parts[2:4], cell, strict=True)]
     base, across = jnp.where(begins, cell, region.base), jnp.where(begins, jnp.stack(sides), region.across)

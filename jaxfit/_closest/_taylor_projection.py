@@ -1,12 +1,12 @@
-"""Feet that one evaluation takes all the way, and the proof that they have arrived.
+"""Foot points from one evaluation of the surface, with a bound that certifies them.
 
-Close to a foot the second-order Taylor polynomial of the surface stands in for the surface,
+Close to a foot the surface is replaced by its second-order Taylor polynomial,
 
     R^ = R + R_s ds + R_t dt + (R_ss ds^2 + 2 R_st ds dt + R_tt dt^2) / 2,
 
-and its foot is found without evaluating anything again. With M a bound on the third derivatives in the cell
-and L = |ds| + |dt|, the surface is within M L^3 / 6 of R^ there and its tangents are within M L^2 / 2 of
-those of R^, which bounds the tangential part of the true residual.
+whose foot is found without another evaluation of the surface. With M a bound on the third derivatives in the
+cell and L = |ds| + |dt|, the surface is within M L^3 / 6 of R^ there and its tangents are within M L^2 / 2 of
+those of R^. This bounds the tangential part of the true residual.
 """
 
 import math
@@ -22,7 +22,7 @@ from jaxfit._closest._forms import Expansion, Forms, both, inner, product, total
 from jaxfit._splines._pieces import Pieces
 
 INSIDE = 1.0 + 1e-6  # in units of a cell's half width: where its polynomial is the surface
-LONGEST_TAYLOR_STEP = 1.0  # in local coordinates; farther off than that, the polynomial says nothing
+LONGEST_TAYLOR_STEP = 1.0  # in local coordinates; farther away the polynomial is no approximation
 ROUNDING = 64.0  # of a squared distance, in units of the last place
 
 
@@ -68,7 +68,7 @@ def certified_step(
     at: Expansion,
     forms: Forms,
     x: Float[Array, "2 1 slots"],
-    pinned: Bool[Array, "2 1 slots"],
+    active: Bool[Array, "2 1 slots"],
     bounds: Bounds,
     third: Float[Array, "1 1 slots"],
     tolerance: Float[Array, ""],
@@ -78,20 +78,20 @@ def certified_step(
     It is certain if the bound proves the true residual's tangential part to be within the tolerance.
     """
 
-    def solve(at: Expansion, forms: Forms, pinned: Array) -> tuple[Array, Array]:
-        # The same matrix once more, on the polynomial: convergence of order three for one evaluation.
-        inverse = _inverse(forms, pinned)
+    def solve(at: Expansion, forms: Forms, active: Array) -> tuple[Array, Array]:
+        # A second step with the same matrix, on the polynomial: order three from one evaluation.
+        inverse = _inverse(forms, active)
         step = inverse(forms.gradient)
         e, tangents = _taylor(at, step)
         return step + inverse(inner(e, tangents)), inverse.free
 
-    step, free = materialise(always, solve, at, forms, pinned)
+    step, free = materialise(always, solve, at, forms, active)
     e, tangents = materialise(always, _taylor, at, step)
 
-    def judge(e: Array, tangents: Array, step: Array, free: Array, forms: Forms, x: Array) -> tuple:
+    def certify(e: Array, tangents: Array, step: Array, free: Array, forms: Forms, x: Array) -> tuple:
         f, length = inner(e, e), total(jnp.abs(step))
         end = x + step * bounds.half
-        # Cut off at a bound a coupled step leads astray.
+        # A coupled step that is cut off at a bound may lead away from the foot.
         nearest = lax.clamp(bounds.low, end, bounds.high)
         allowed = nearest == end
         within = allowed & _in_cell(bounds, x) & _in_cell(bounds, end)
@@ -99,10 +99,10 @@ def certified_step(
         turned = 0.5 * third * length * length
         # The product of the true residual with a tangent is at most
         # |e . R^_s| + |e| M L^2 / 2 + (M L^3 / 6) (|R^_s| + M L^2 / 2).
-        doubt = jnp.sqrt(f) * turned + (1.0 / 3.0) * turned * length * (sizes + turned)
-        proven = jnp.abs(slopes) + doubt <= tolerance * (sizes - turned)
-        # What is held at a bound goes on being held there; along so short a tangent nothing moves.
-        held = (slopes * forms.gradient > 0) & (jnp.abs(slopes) >= doubt)
+        bound = jnp.sqrt(f) * turned + (1.0 / 3.0) * turned * length * (sizes + turned)
+        proven = jnp.abs(slopes) + bound <= tolerance * (sizes - turned)
+        # A coordinate at an active bound must stay active there, or its tangent be too short to matter.
+        held = (slopes * forms.gradient > 0) & (jnp.abs(slopes) >= bound)
         proven |= (free == 0) & (held | (sizes + turned <= tolerance))
         eps = ROUNDING * float(jnp.finfo(f.dtype).eps)
         nearer = f <= forms.f * (1.0 + eps) + tolerance**2
@@ -111,13 +111,13 @@ def certified_step(
         good = nearer & downhill & both(allowed) & (length < LONGEST_TAYLOR_STEP)
         return Prediction(nearest, e, f, certain), good
 
-    return materialise(always, judge, e, tangents, step, free, forms, x)
+    return materialise(always, certify, e, tangents, step, free, forms, x)
 
 
-def _inverse(forms: Forms, pinned: Array) -> _Inverse:
+def _inverse(forms: Forms, active: Array) -> _Inverse:
     diagonal, mixed = forms.hessian
-    free = (~pinned).astype(diagonal.dtype)
-    diagonal = lax.select(pinned, jnp.ones_like(diagonal), diagonal)
+    free = (~active).astype(diagonal.dtype)
+    diagonal = lax.select(active, jnp.ones_like(diagonal), diagonal)
     mixed = mixed * product(free)
     determinant = product(diagonal) - mixed * mixed
     definite = (diagonal[:1] > 0) & (determinant > 0)
@@ -127,9 +127,9 @@ def _inverse(forms: Forms, pinned: Array) -> _Inverse:
 
 def _taylor(at: Expansion, step: Array) -> tuple[Array, Array]:
     """The residual and the tangents of the polynomial after a step."""
-    bend = step * at.second[:2] + lax.rev(step, (0,)) * at.second[2:]
-    e = at.e - total(step * (at.first + 0.5 * bend))
-    return e, at.first + bend
+    turn = step * at.second[:2] + lax.rev(step, (0,)) * at.second[2:]
+    e = at.e - total(step * (at.first + 0.5 * turn))
+    return e, at.first + turn
 
 
 def _in_cell(bounds: Bounds, x: Array) -> Array:
@@ -148,7 +148,7 @@ def linearised_step(
     A step that would lengthen it is cut to where it is shortest.
     """
     along = total(forms.gradient * step)
-    length2 = total(forms.metric * step * step) + 2.0 * forms.skew * product(step)
+    length2 = total(forms.metric * step * step) + 2.0 * forms.metric_mixed * product(step)
     shortest = jnp.maximum(along, 0.0) / jnp.where(length2 > 0, length2, 1.0)
     step = jnp.where(2.0 * along >= length2, step, shortest * step)
     e = at.e - total(step * at.first)

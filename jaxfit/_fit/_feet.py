@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfit._closest import AbstractFootMethod, Border, project, update_feet
+from jaxfit._closest import AbstractFootMethod, ParameterBounds, project, update_feet
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._splines._pieces import Axis, Pieces
@@ -35,7 +35,7 @@ def measure_grid(
     before: Projection,
     foot_tolerance: Any,
     held: Bool[Any, " points"],
-    within: Border | None = None,
+    within: ParameterBounds | None = None,
 ) -> Projection:
     """Feet of a grid's points, except those that are `held`.
 
@@ -53,12 +53,12 @@ def measure_grid(
         True,
         within,
     )
-    error = jnp.where(held, 0.0, jnp.sqrt(jnp.where(held, 0.0, feet.best)))
+    error = jnp.where(held, 0.0, jnp.sqrt(jnp.where(held, 0.0, feet.squared_distance)))
     active = jnp.sum(problem.counted, dtype=jnp.int32)
     return Projection(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True))
 
 
-def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> Border:
+def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> ParameterBounds:
     """Bounds that keep the feet of a grid's border points on their border curves."""
     bounds = []
     for axis, number in zip(axes, (np.arange(nu)[:, None], np.arange(nv)[None, :]), strict=True):

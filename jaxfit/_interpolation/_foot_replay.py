@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._closest import Border
+from jaxfit._closest import ParameterBounds
 from jaxfit._closest._implicit import foot_change
 from jaxfit._compile import compiled
 from jaxfit._fit._border import corners
@@ -126,7 +126,7 @@ class FootReplay(eqx.Module):
     axes: tuple[Axis, Axis]
     tables: tuple[SpanTable, SpanTable]
     data: Float[Array, "d nu nv"]
-    within: Border | None
+    within: ParameterBounds | None
     diagonal: Array
     tolerance: Array
     foot_tolerance: Array
@@ -235,6 +235,6 @@ def _linearised(primals: Any, tangents: Any) -> tuple[tuple[Array, ...], tuple[A
     return (u, v, e, along_u[0], along_v[0]), (du, dv, de, d_basis_u, d_basis_v)
 
 
-def _domain(axes: tuple[Axis, Axis]) -> Border:
+def _domain(axes: tuple[Axis, Axis]) -> ParameterBounds:
     (low_u, high_u), (low_v, high_v) = ((x.breaks[0], x.breaks[-1]) for x in axes)
     return low_u, high_u, low_v, high_v

@@ -1,4 +1,4 @@
-"""Foot points on their way, and what they have to reach."""
+"""`FootStates`, the feet during an iteration, and `FootLimits`, when the iteration ends."""
 
 from typing import Any
 
@@ -7,15 +7,16 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-# States of a foot. What the caller sums over the points has been taken from those from SUMMED_FOUND on.
+# States of a foot: still moving, found to the tolerance, or given up. The last two are found and given up
+# feet that the sums already include.
 GOING, FOUND, GIVEN_UP, SUMMED_FOUND, SUMMED_GIVEN_UP = range(5)
 
 
-class Feet(eqx.Module):
+class FootStates(eqx.Module):
     """Trial parameters, and the best (last accepted) foot of every point.
 
-    One array, so that gathering, scattering and choosing are one operation each: trial u and v, best u and v,
-    squared distance, evaluations, state.
+    All numbers are in one array, so that a gather, a scatter or a selection is one operation. Its rows: trial
+    u and v, best u and v, squared distance, evaluations, state.
     """
 
     parts: Float[Array, "7 points"]
@@ -23,10 +24,10 @@ class Feet(eqx.Module):
     @staticmethod
     def begin(
         u: Float[Array, " points"], v: Float[Array, " points"], steps: Any = 0, state: Any = GOING
-    ) -> "Feet":
+    ) -> "FootStates":
         """Feet that have not been evaluated yet."""
         numbers = (jnp.broadcast_to(jnp.asarray(x, u.dtype), u.shape) for x in (jnp.inf, steps, state))
-        return Feet(jnp.stack([u, v, u, v, *numbers]))
+        return FootStates(jnp.stack([u, v, u, v, *numbers]))
 
     @property
     def trial(self) -> Float[Array, "2 points"]:
@@ -44,7 +45,7 @@ class Feet(eqx.Module):
         return self.parts[3]
 
     @property
-    def best(self) -> Float[Array, " points"]:
+    def squared_distance(self) -> Float[Array, " points"]:
         """Squared distance of the last accepted foot, infinite before the first evaluation."""
         return self.parts[4]
 
@@ -55,7 +56,7 @@ class Feet(eqx.Module):
 
     @property
     def state(self) -> Float[Array, " points"]:
-        """GOING, FOUND to the tolerance, GIVEN_UP, or one of the latter with its part of the sums taken."""
+        """One of the constants above."""
         return self.parts[6]
 
     @property
@@ -63,13 +64,13 @@ class Feet(eqx.Module):
         """Whether the foot has been found to the tolerance."""
         return (self.state == FOUND) | (self.state == SUMMED_FOUND)
 
-    def with_state(self, state: Float[Array, " points"]) -> "Feet":
+    def with_state(self, state: Float[Array, " points"]) -> "FootStates":
         """The same feet in another state."""
-        return Feet(jnp.concatenate([self.parts[:6], state[None]]))
+        return FootStates(jnp.concatenate([self.parts[:6], state[None]]))
 
 
-class Limits(eqx.Module):
-    """What a foot has to reach, and with how many evaluations.
+class FootLimits(eqx.Module):
+    """The tolerance for a foot, and the largest number of evaluations.
 
     `tolerance` is the allowed tangential part of the residual, a length; `noise` the rounding of one.
     """
@@ -79,22 +80,22 @@ class Limits(eqx.Module):
     steps: Float[Array, ""]
 
     @staticmethod
-    def of(tolerance: Any, reach: Float[Array, ""], steps: Any) -> "Limits":
+    def of(tolerance: Any, reach: Float[Array, ""], steps: Any) -> "FootLimits":
         """With no tolerance below the rounding of a residual; no coordinate is larger than `reach`."""
         noise = 4.0 * jnp.finfo(reach.dtype).eps * reach
         tolerance = jnp.maximum(jnp.asarray(tolerance, reach.dtype), 4.0 * noise)
-        return Limits(tolerance, noise, jnp.asarray(steps, reach.dtype))
+        return FootLimits(tolerance, noise, jnp.asarray(steps, reach.dtype))
 
-    def slack(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    def rounding_of(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """Rounding of a squared distance."""
         return self.noise * (2.0 * jnp.sqrt(f) + self.noise)
 
 
-def is_going(feet: Feet, limits: Limits) -> Bool[Array, " points"]:
-    """Which feet are to be moved on."""
+def is_going(feet: FootStates, limits: FootLimits) -> Bool[Array, " points"]:
+    """Which feet still move: neither found nor given up, with evaluations left."""
     return (feet.state == GOING) & (feet.parts[5] < limits.steps)
 
 
-def keep(which: Bool[Array, " points"], old: Feet, new: Feet) -> Feet:
+def select_feet(which: Bool[Array, " points"], old: FootStates, new: FootStates) -> FootStates:
     """`old` where `which`, `new` elsewhere."""
-    return Feet(jnp.where(which[None], old.parts, new.parts))
+    return FootStates(jnp.where(which[None], old.parts, new.parts))
