@@ -51,16 +51,24 @@ class AbstractIterativeMethod(eqx.Module):
                  iterate, history = move(problem, iterate, history)
         iterate, stats = postprocess(problem, iterate, stopped_early)
 
-    The state is any pytree of arrays whose structure and shapes do not change; the loop does not use it. All
-    lengths are in the unit of the problem. `init` sees concrete values outside transformations; the other
-    functions are traced. Fields that are Python floats are traced, so that another value compiles nothing;
-    all other fields are static.
+    All six functions are called by the loop only. Lengths are in the unit of the problem, in which the
+    diagonal of the data is about 1, and errors in the history are fractions of that diagonal. Points are
+    padded, and those of weight 0 must not influence the surface.
+
+    The state is any pytree of arrays whose structure, shapes and dtypes do not change; the loop does not use
+    it. What a method remembers from one function to the next has to be in it. Outside transformations `init`
+    is called with NumPy arrays; the other functions are always traced, so they use `jnp.where` and `lax.cond`
+    instead of `if`.
+
+    A method is an `equinox.Module`, and its fields are its options. Fields that are Python floats are traced,
+    so that another value compiles nothing; all other fields are static and must be hashable. The two
+    properties below may be plain class attributes, as in `stall_since = 0`.
 
     Attributes
     ----------
     stall_window, stall_gain : int, float
-        The fit stops as stalled when neither error has fallen by the share `stall_gain` within
-        `stall_window` iterations.
+        Fields that a method must have. The fit stops as stalled when neither error has fallen by the share
+        `stall_gain` within `stall_window` iterations.
 
     Examples
     --------
@@ -89,16 +97,18 @@ class AbstractIterativeMethod(eqx.Module):
     def init(
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, Any]:
-        """The first surface, with room for knots if the method inserts any, and the first state.
+        """The surface to begin with, usually `surface` itself, and the first state.
 
-        Of `projection` only u and v are known.
+        Of `projection` only u and v are known. A method that inserts knots returns `surface.padded(...)`:
+        arrays cannot grow later.
         """
 
     @abstractmethod
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, Any]:
         """The projection of the points onto the iterate's surface, and the next state.
 
-        Where `exact`, feet must have converged; otherwise errors may be predictions.
+        Start from `iterate.projection`, the feet on the surface before. Where `exact` (traced) holds, feet
+        must have converged; otherwise errors may be predictions, if `Projection.exact` says so.
         """
 
     @abstractmethod
@@ -110,13 +120,17 @@ class AbstractIterativeMethod(eqx.Module):
 
     @abstractmethod
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
-        """The next iterate. A method that makes several steps in one move records their errors itself."""
+        """The next iterate: another surface, `iterate.projection`, the next state, and `iterate.step + 1`.
+
+        `history` ends with the errors of `iterate`, and is returned as it is. Only a method that makes
+        several steps in one move records their errors itself, by `history.append`.
+        """
 
     @abstractmethod
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
-        """The iterate to return, and the method's entries of the fit's `stats`.
+        """The iterate to return, usually `iterate` itself, and the method's entries of the fit's `stats`.
 
         `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate may be better.
         """
@@ -128,7 +142,7 @@ def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
 
 
 def check_method(method: Any) -> None:
-    """Raise unless the fields that methods have in common are valid."""
+    """Raise unless the fields that the methods of this library have in common are valid."""
     check_number("stall_window", method.stall_window, 1, whole=True)
     check_number("stall_gain", method.stall_gain, 0.0)
     check_number("foot_tolerance", method.foot_tolerance, 0.0)
