@@ -113,13 +113,7 @@ class Tukey(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 14 standard deviations, estimated anew in
-        each iteration from the distance that 90 % of the points do not exceed.
-
-    Raises
-    ------
-    ValueError
-        If `scale` is not positive.
+        As for `Huber`, but by default 14 standard deviations.
 
     Notes
     -----
@@ -149,13 +143,7 @@ class GemanMcClure(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        c, as a fraction of the diagonal. By default 7 standard deviations, estimated anew in
-        each iteration from the distance that 90 % of the points do not exceed.
-
-    Raises
-    ------
-    ValueError
-        If `scale` is not positive.
+        As for `Huber`, but by default 7 standard deviations.
 
     Notes
     -----
