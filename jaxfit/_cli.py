@@ -52,20 +52,20 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     started = time.perf_counter()
     try:
-        _interrupt.raise_again()
+        _interrupt.restore_ctrl_c()
         args = argument_parser().parse_args(argv)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             return _fit_command(args, started)
     except KeyboardInterrupt:
-        return _complain("interrupted, nothing more is written.", INTERRUPTED)
+        return _fail("interrupted, nothing more is written.", INTERRUPTED)
     except (ValueError, TypeError, OSError) as error:
-        return _complain(error, BAD_INPUT)
+        return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
-        return _complain(f"the fit failed: {error or type(error).__name__}", FAILED)
+        return _fail(f"the fit failed: {error or type(error).__name__}", FAILED)
 
 
-def _complain(sentence: object, code: int) -> int:
+def _fail(sentence: object, code: int) -> int:
     print("jaxfit: error:", " ".join(str(sentence).split()), file=sys.stderr)
     return code
 
@@ -73,7 +73,7 @@ def _complain(sentence: object, code: int) -> int:
 def _fit_command(args: argparse.Namespace, started: float) -> int:
     jax.config.update("jax_enable_x64", not args.float32)
     picture = _check_files(args)
-    _keep_programs(args)
+    _set_compile_cache(args)
     data = _read(args)
     if picture:  # while the fit is compiled, which leaves Python idle
         threading.Thread(target=_load_matplotlib, daemon=True).start()
@@ -85,7 +85,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
         average, maximum = float(fit.average_error), float(fit.maximum_error)
         seconds = time.perf_counter() - before
     if not (math.isfinite(average) and math.isfinite(maximum)):
-        return _complain(f"the fit failed: {fit.message}", FAILED)
+        return _fail(f"the fit failed: {fit.message}", FAILED)
     io.write_surface(args.output, fit.surface)
     if picture:
         from jaxfit.plot import surface_and_errors
@@ -107,7 +107,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     return REACHED if _reached(args, method, fit, average, maximum) else NOT_REACHED
 
 
-def _keep_programs(args: argparse.Namespace) -> None:
+def _set_compile_cache(args: argparse.Namespace) -> None:
     """Have JAX keep what it compiles, where the user has not told JAX itself where to."""
     kept_by_jax = getattr(jax.config, "jax_compilation_cache_dir", None)
     if args.no_cache or (kept_by_jax and args.cache is None and VARIABLE not in os.environ):

@@ -23,7 +23,7 @@ def cache_folder(asked: str | None = None) -> Path | None:
     trial = folder / f".{os.getpid()}"
     trial.touch()
     trial.unlink()
-    _bound(folder)
+    _remove_oldest(folder)
     return folder.absolute()
 
 
@@ -36,7 +36,7 @@ def _user_cache() -> Path:
     return named if named.is_absolute() else Path.home() / ".cache"
 
 
-def _bound(folder: Path) -> None:
+def _remove_oldest(folder: Path) -> None:
     """Remove the programs that were not used for longest, beyond `LARGEST`, and empty ones.
 
     JAX has a bound of its own, but it needs one more package and locks the folder at every look.

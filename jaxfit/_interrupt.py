@@ -15,21 +15,21 @@ def end_at_once(*_: Any) -> None:
     os._exit(EXIT_CODE)
 
 
-def is_the_command() -> bool:
+def is_command() -> bool:
     """Whether this process is `jaxfit` or `python -m jaxfit`, and not a program that uses the package."""
     name = os.path.basename(getattr(sys, "argv", [""])[0])
     as_module = name == "-m" and ("-m", "jaxfit") in pairwise(sys.orig_argv)
     return as_module or os.path.splitext(name)[0] in ("jaxfit", "jaxfit-script")
 
 
-def raise_again() -> None:
+def restore_ctrl_c() -> None:
     """Have Ctrl-C raise KeyboardInterrupt as usual, once there is someone to catch it."""
     if signal.getsignal(signal.SIGINT) is end_at_once:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 if (
-    is_the_command()
+    is_command()
     and threading.current_thread() is threading.main_thread()
     and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ):

@@ -14,7 +14,7 @@ DEFAULT_FOOT_TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 DEFAULT_INTERPOLATION_TOLERANCE = {"float64": 1e-12, "float32": 2e-6}
 # Where rounding alone costs more than this, a fit that asks for nothing has not converged either.
 WORST_TOLERANCE = 1e-3
-_said = False
+_advised = False
 
 
 def working_dtype() -> np.dtype:
@@ -45,10 +45,10 @@ def interpolation_tolerance(tolerance: Any, dtype: np.dtype, least: Any) -> tupl
 
 def advise_x64(tolerance: float, dtype: np.dtype, stacklevel: int = 4) -> None:
     """Tell the user, once a session, that a tolerance is out of reach in this precision."""
-    global _said
-    if _said or np.dtype(dtype).itemsize >= 8 or tolerance >= 1e-6:
+    global _advised
+    if _advised or np.dtype(dtype).itemsize >= 8 or tolerance >= 1e-6:
         return
-    _said = True
+    _advised = True
     warnings.warn(
         f"the tolerance {tolerance:g} is beyond {np.dtype(dtype).name}; switch on "
         "double precision, the flag jax_enable_x64 of jax.config.",

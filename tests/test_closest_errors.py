@@ -36,7 +36,7 @@ def test_points_must_be_numbers():
 
 @pytest.mark.float32_too
 def test_the_advice_to_use_double_precision_is_given_once(monkeypatch, recwarn):
-    monkeypatch.setattr(_precision, "_said", False)
+    monkeypatch.setattr(_precision, "_advised", False)
     surface = helpers.wavy_surface(dtype=jnp.float32)
     points = np.zeros((5, 3), np.float32)
     with pytest.warns(UserWarning, match="jax_enable_x64"):

@@ -7,7 +7,7 @@ import pytest
 from helpers import count_compilations, wavy_cloud
 
 import jaxfit as jf
-from jaxfit._approximation._knot_insertion import refined
+from jaxfit._approximation._knot_insertion import insert_in_worst_spans
 from jaxfit._fit._working_surface import WorkingSurface
 
 POINTS, EDGES = wavy_cloud(500, height=0.3)
@@ -49,13 +49,13 @@ def test_the_surface_is_the_same_before_and_after_an_insertion(base):
     u, v = np.random.default_rng(0).random((2, 300))
     error = np.where((u > 0.6) & (v < 0.3), 1.0, 0.01)
     for _ in range(2):
-        surface = jax.jit(refined)(surface, *map(jnp.asarray, (u, v, error)))
+        surface = jax.jit(insert_in_worst_spans)(surface, *map(jnp.asarray, (u, v, error)))
     after = jf.BSplineSurface(surface.control_points, surface.knots_u, surface.knots_v)
     assert np.abs(np.asarray(after(u, v) - base(u, v))).max() < 1e-14
     added = np.setdiff1d(np.asarray(surface.knots_u), np.asarray(base.knots_u))
     assert added.size == 2
     assert (added > 0.5).all()
-    full = jax.jit(refined)(surface, *map(jnp.asarray, (u, v, error)))
+    full = jax.jit(insert_in_worst_spans)(surface, *map(jnp.asarray, (u, v, error)))
     assert (np.asarray(full.control_points) == np.asarray(surface.control_points)).all()
 
 

@@ -8,7 +8,7 @@ from helpers import count_compilations, eps, wavy_cloud
 from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
-from jaxfit._approximation._automatic_smoothing import Candidates
+from jaxfit._approximation._automatic_smoothing import SmoothingCandidates
 from jaxfit._approximation._least_squares import StructuredSolver, least_squares_problem
 from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
@@ -200,13 +200,13 @@ def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
 
 def test_the_discrepancy_principle_stops_at_the_noise():
     smoothing = jnp.asarray([1e-3, 1e-2, 1e-1])
-    found = Candidates(smoothing, jnp.asarray([1.0, 4.0, 16.0]), smoothing, jnp.asarray(400.0))
+    found = SmoothingCandidates(smoothing, jnp.asarray([1.0, 4.0, 16.0]), smoothing, jnp.asarray(400.0))
     assert abs(float(jf.Discrepancy(noise=0.1).best(found)) - 1e-2) < 1e-6
 
 
 def test_noise_that_no_lambda_reaches_is_left_to_cross_validation():
     smoothing, effective = jnp.asarray([1e-4, 1e-3, 1e-2, 1e-1]), jnp.asarray([300.0, 200.0, 10.0, 1.0])
-    found = Candidates(smoothing, jnp.asarray([1.0, 1.0, 1.1, 16.0]), effective, jnp.asarray(400.0))
+    found = SmoothingCandidates(smoothing, jnp.asarray([1.0, 1.0, 1.1, 16.0]), effective, jnp.asarray(400.0))
     chosen = float(jf.Discrepancy(noise=1e-3).best(found))
     assert 2e-3 < chosen < 5e-2
     assert chosen == float(jf.GeneralizedCrossValidation().best(found))

@@ -30,7 +30,7 @@ from jaxfit._splines._pieces import pieces_on
 DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same trace
 
 
-class Candidates(eqx.Module):
+class SmoothingCandidates(eqx.Module):
     """Several lambdas in increasing order, each with its residual and its effective number of parameters."""
 
     smoothing: Float[Array, " lambdas"]
@@ -43,7 +43,7 @@ class AbstractSmoothing(eqx.Module):
     """A rule that selects lambda."""
 
     @abstractmethod
-    def best(self, candidates: Candidates) -> Float[Array, ""]:
+    def best(self, candidates: SmoothingCandidates) -> Float[Array, ""]:
         """The lambda to take."""
 
 
@@ -84,7 +84,7 @@ class GeneralizedCrossValidation(AbstractSmoothing):
     def __check_init__(self) -> None:
         _check_counts(self)
 
-    def best(self, candidates: Candidates) -> Float[Array, ""]:
+    def best(self, candidates: SmoothingCandidates) -> Float[Array, ""]:
         """The interpolated minimum."""
         return _cross_validated(candidates)
 
@@ -129,7 +129,7 @@ class Discrepancy(AbstractSmoothing):
         check_number("noise", self.noise, 0.0)
         _check_counts(self)
 
-    def best(self, candidates: Candidates) -> Float[Array, ""]:
+    def best(self, candidates: SmoothingCandidates) -> Float[Array, ""]:
         """The lambda at which the residual sum of squares equals that of the noise."""
         goal = jnp.log(candidates.points) + 2.0 * np.log(max(self.noise, 1e-30))
         remaining = lax.cummax(jnp.log(candidates.remaining))
@@ -137,7 +137,7 @@ class Discrepancy(AbstractSmoothing):
         return jnp.where(remaining[0] <= goal, passed, _cross_validated(candidates))
 
 
-def _cross_validated(candidates: Candidates) -> Float[Array, ""]:
+def _cross_validated(candidates: SmoothingCandidates) -> Float[Array, ""]:
     left = 1.0 - candidates.effective / candidates.points
     score = jnp.log(candidates.remaining) - 2.0 * jnp.log(jnp.maximum(left, 1e-3))
     k = jnp.clip(jnp.argmin(score), 1, score.shape[0] - 2)
@@ -159,7 +159,7 @@ PROBES = 16
 
 def evaluate_candidates(
     system: RegularisedSystem, held: Bool[Any, "nu nv"], net: Float[Array, "nu nv d"], count: int
-) -> Candidates:
+) -> SmoothingCandidates:
     """All candidates for the correction of `net`; one factorisation for each."""
     data, plate = system.data_stencil(), system.plate.stencil()
     free = free_points(data.plus(plate, 1.0), held)
@@ -188,7 +188,7 @@ def evaluate_candidates(
     remaining, effective = lax.map(one, smoothing)
     remaining = jnp.maximum(remaining, tiny)
     points = jnp.sum(system.root > 0).astype(net.dtype)
-    return Candidates(smoothing, remaining, effective, points)
+    return SmoothingCandidates(smoothing, remaining, effective, points)
 
 
 def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[Array, "3 rows width"]:

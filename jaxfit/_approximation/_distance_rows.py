@@ -23,7 +23,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._free_tangents import FreeTangents
+from jaxfit._approximation._foot_tangents import FootTangents
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Rows,
@@ -93,7 +93,7 @@ def _rows_at(
     coefficients = row_coefficients(pieces, part)
     jet = materialise(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
     e = target - jet.value
-    tangential = FreeTangents.at(pieces, u, v, e, jet).entries()
+    tangential = FootTangents.at(pieces, u, v, e, jet).entries()
     d = target.shape[0]
     same = jnp.asarray(np.equal(*np.triu_indices(d)), s.dtype)[:, None, None]
     return s, t, weight[None] * e, weight[None] * (same - (1.0 - damping) * tangential)

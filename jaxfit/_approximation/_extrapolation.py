@@ -23,7 +23,7 @@ class Extrapolation(eqx.Module):
     rms_step: Float[Any, ""]
 
     @staticmethod
-    def none(u: Any) -> "Extrapolation":
+    def initial(u: Any) -> "Extrapolation":
         """Before the first step; `u` gives shape and type."""
         xp: Any = np if is_concrete(u) else jnp
         return Extrapolation(xp.zeros((2, *u.shape), u.dtype), xp.asarray(np.inf, u.dtype))

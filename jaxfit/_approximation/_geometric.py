@@ -13,9 +13,9 @@ from jaxfit._approximation._control_point_sums import ControlPointSums, Weighted
 from jaxfit._approximation._extrapolation import Extrapolation
 from jaxfit._approximation._fairing import Fairing
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
-from jaxfit._approximation._local_region import region_of
+from jaxfit._approximation._local_region import local_region
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
-from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, at_rest
+from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, zero_momentum
 from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
@@ -168,8 +168,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         net = surface.control_points
         xp: Any = np if is_concrete(net, projection) else jnp
         sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
-        momentum = None if self.acceleration is None else at_rest(net)
-        extrapolation = Extrapolation.none(projection.u) if self._extrapolates else None
+        momentum = None if self.acceleration is None else zero_momentum(net)
+        extrapolation = Extrapolation.initial(projection.u) if self._extrapolates else None
         exceeded = projection.converged if self.local else None
         return surface, GeometricState(sums, momentum, exceeded, extrapolation)
 
@@ -185,8 +185,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         resting = ~jnp.asarray(problem.real)
         if self.local:
             assert state.exceeded is not None
-            region = region_of(pieces, before.u, before.v, state.exceeded)
-            resting = resting | (~region.alive & ~exact)
+            region = local_region(pieces, before.u, before.v, state.exceeded)
+            resting = resting | (~region.points & ~exact)
         feet, sums = self._feet(problem, pieces, state, before, resting, exact)
         error = jnp.where(resting, before.error, feet.error)
         extrapolation = state.extrapolation
@@ -197,10 +197,10 @@ class GeometricApproximation(AbstractIterativeMethod):
         exceeded = state.exceeded
         if self.local:
             errors = jnp.where(problem.counted, error, 0.0) / problem.diagonal
-            exceeded = exceeded | (errors > _threshold(problem, jnp.max(errors)))
+            exceeded = exceeded | (errors > _local_tolerance(problem, jnp.max(errors)))
             # Sums are complete where all points were projected, or all that influence the control point.
-            after = region_of(pieces, feet.u, feet.v, exceeded)
-            complete = jnp.where(exact, after.touched, region.touched)
+            after = local_region(pieces, feet.u, feet.v, exceeded)
+            complete = jnp.where(exact, after.control_points, region.control_points)
             sums = jnp.where(complete[..., None], sums, 0.0)
         certain = exact | (not self.single_step)
         converged = jnp.where(certain, feet.converged, before.converged)
@@ -277,7 +277,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         if self.insertion is not None:
             surface = self.insertion(step, surface, iterate.projection, problem.counted)
         if momentum is not None:
-            rest = at_rest(surface.control_points)
+            rest = zero_momentum(surface.control_points)
             momentum = lax.cond(changed, lambda: rest, lambda: momentum)
         state = GeometricState(state.sums, momentum, state.exceeded, state.extrapolation)
         return Iterate(surface, iterate.projection, state, step), history
@@ -289,7 +289,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         return iterate, {}
 
 
-def _threshold(problem: Problem, maximum: Array) -> Array:
-    """The error beyond which local mode goes on."""
+def _local_tolerance(problem: Problem, maximum: Array) -> Array:
+    """The tolerance that local mode works towards."""
     goal = problem.tolerances
     return jnp.where(maximum <= goal.maximum, goal.average, goal.maximum)

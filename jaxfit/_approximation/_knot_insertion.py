@@ -63,7 +63,7 @@ class KnotInsertion(eqx.Module):
         error = jnp.where(counted, projection.error, 0.0)
         return lax.cond(
             step % self.every == 0,
-            lambda: refined(surface, projection.u, projection.v, error),
+            lambda: insert_in_worst_spans(surface, projection.u, projection.v, error),
             lambda: surface,
         )
 
@@ -82,15 +82,17 @@ def check_insertion(insertion: Any) -> None:
         check_kind("insertion", insertion, KnotInsertion, "KnotInsertion()")
 
 
-def refined(surface: WorkingSurface, u: Array, v: Array, error: Array) -> WorkingSurface:
+def insert_in_worst_spans(surface: WorkingSurface, u: Array, v: Array, error: Array) -> WorkingSurface:
     """The surface with one more knot in the worst span of u and of v, while there is room."""
-    net, knots_u, axis_u = _refined(surface.control_points, surface.knots_u, surface.axis_u, u, error)
+    net, knots_u, axis_u = _insert_in_worst_span(
+        surface.control_points, surface.knots_u, surface.axis_u, u, error
+    )
     transposed = jnp.swapaxes(net, 0, 1)
-    transposed, knots_v, axis_v = _refined(transposed, surface.knots_v, surface.axis_v, v, error)
+    transposed, knots_v, axis_v = _insert_in_worst_span(transposed, surface.knots_v, surface.axis_v, v, error)
     return WorkingSurface(jnp.swapaxes(transposed, 0, 1), knots_u, knots_v, axis_u, axis_v)
 
 
-def _refined(
+def _insert_in_worst_span(
     net: Float[Array, "n m d"], knots: Float[Array, " knots"], axis: Axis, u: Array, error: Array
 ) -> tuple[Float[Array, "n m d"], Float[Array, " knots"], Axis]:
     """Net, knots and axis with one more knot along the first direction."""

@@ -21,7 +21,7 @@ class Momentum(eqx.Module):
     weight: Float[Any, ""]
 
 
-def at_rest(net: Any) -> Momentum:
+def zero_momentum(net: Any) -> Momentum:
     """No momentum."""
     xp: Any = np if is_concrete(net) else jnp
     return Momentum(net, xp.ones((), net.dtype))

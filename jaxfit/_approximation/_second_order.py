@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._free_tangents import FreeTangents
+from jaxfit._approximation._foot_tangents import FootTangents
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Jet,
@@ -75,7 +75,7 @@ def _second_derivative_at(
     coefficients = row_coefficients(moves, part)
     value, value_s, value_t = materialise(always, lambda *x: evaluate_jet(*x)[:3], coefficients, s, t)
     e = target - jet.value
-    free = FreeTangents.at(pieces, u, v, e, jet)
+    free = FootTangents.at(pieces, u, v, e, jet)
     along = free.coordinates(value)
     right = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
     slide, valid = _slide(free, e, jet, along, right)
@@ -86,7 +86,7 @@ def _second_derivative_at(
 
 
 def _slide(
-    free: FreeTangents, e: Array, jet: Jet, along: tuple[Array, Array], right: tuple[Array, Array]
+    free: FootTangents, e: Array, jet: Jet, along: tuple[Array, Array], right: tuple[Array, Array]
 ) -> tuple[tuple[Array, Array], Array]:
     """The moves of the feet, and whether these are valid: near the surface, by its radii of curvature.
 

@@ -6,7 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base._base_method import AbstractBaseMethod, Coons
-from jaxfit._base._boundary import Boundary, farthest, frame
+from jaxfit._base._boundary import Boundary, centre_and_size, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._default_net import default_net
@@ -106,7 +106,7 @@ def base_surface(
     for each in clouds:
         check_same_place(each, boundary)
     # Centred and of size one, so that neither units nor coordinates in the millions matter.
-    centre, size = frame(sides)
+    centre, size = centre_and_size(sides)
     lines = [(x.astype(float) - centre) / size for x in sides]
     reach = 2 * farthest(centre, *sides, *clouds)
     curves = _curves(lines, net, order, tolerance * reach / size, dtype)

@@ -103,7 +103,7 @@ def diagonal(*sets: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(np.concatenate(sets).astype(float), axis=0)))
 
 
-def frame(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
+def centre_and_size(sides: list[np.ndarray]) -> tuple[np.ndarray, float]:
     """Centre of gravity of the polylines, and twice the greatest distance from it: the size.
 
     For a rectangle the size is the diagonal. Unlike the bounding box, both turn with the boundary.

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from jaxfit._base._base_surface import base_surface
 from jaxfit._base._boundary import Boundary
 from jaxfit._base._coons import GREVILLE, coons_net
-from jaxfit._base._host_splines import Frame, Knots
+from jaxfit._base._host_splines import GridEvaluator, Knots
 from jaxfit._splines import BSplineSurface, greville_abscissae
 
 
@@ -39,7 +39,7 @@ def _interpolated(
     old = (np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float))
     places = [np.asarray(greville_abscissae(t, k), float) for t, k in zip(knots, order, strict=True)]
     net = np.asarray(surface.control_points, float)
-    values = Frame(old, surface.order, *places).points(net)
+    values = GridEvaluator(old, surface.order, *places).points(net)
     for axis, (t, k, at) in enumerate(zip(knots, order, places, strict=True)):
         values = make_interp_spline(at, values, k - 1, t=t, axis=axis).c
         values = np.moveaxis(values, 0, axis) if axis else values

@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._base._point_normals import frames, oriented
+from jaxfit._base._point_normals import oriented, principal_axes
 
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many
-WIDTH = 4  # times the neighbours asked for: the most that symmetry may add
+MOST_WIDTH = 4  # times the neighbours asked for: the most that symmetry may add
 COCIRCULAR = 1e-7  # sine of an angle of the hull that still counts as straight
-STEEP = 3  # powers of the cosine that a step out of the plane is lengthened by
-LEAST = 0.05  # the least such cosine
+SLOPE_POWER = 3  # powers of the cosine that a step out of the plane is lengthened by
+LEAST_COSINE = 0.05  # the least such cosine
 WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than this
-ACROSS = 1000  # points with a wide gap that may be neighbours across it
+MOST_ACROSS = 1000  # points with a wide gap that may be neighbours across it
 ENTRIES = 1 << 20  # of arrays at once, in the search for these
 
 
@@ -49,34 +49,34 @@ def stars(points: Float[Any, "points d"], count: int, fixed: int = 0) -> Stars:
     """
     members, filled = neighbourhoods(points, count)
     planes = _planes(points, members, filled)
-    star = _among(planes, np.arange(len(points)), members, filled)
+    star = _stars_among(planes, np.arange(len(points)), members, filled)
     gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
     rows = gaping[gaping >= fixed]
-    at_once = max(ENTRIES // min(len(gaping) + 1, ACROSS), 1)
+    at_once = max(ENTRIES // min(len(gaping) + 1, MOST_ACROSS), 1)
     for k in range(0, len(rows), at_once):
         part = rows[k : k + at_once]
-        members, filled = _with(star, points, part, gaping)
-        star = _replaced(star, part, _among(planes, part, members, filled))
+        members, filled = _with_nearest(star, points, part, gaping)
+        star = _replaced(star, part, _stars_among(planes, part, members, filled))
     return star
 
 
-def _among(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
+def _stars_among(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
     """The stars of the points `rows` among given ones."""
-    plane = _unrolled(planes, rows, members, filled)
+    plane = _in_tangent_planes(planes, rows, members, filled)
     angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
     order = np.argsort(angle, axis=1, kind="stable")
-    members, filled, plane = _taken((members, filled, plane), order)
+    members, filled, plane = _reordered((members, filled, plane), order)
     members, filled, plane = _hulls(members, filled, plane)
     return Stars(members, filled, plane, _angles_between(plane, filled))
 
 
-def _with(
+def _with_nearest(
     star: Stars, points: np.ndarray, rows: np.ndarray, others: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The members of these stars, and the nearest of the `others` that are not among them."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(points[others]).query(points[rows], min(len(others), ACROSS))[1]
+    near = cKDTree(points[others]).query(points[rows], min(len(others), MOST_ACROSS))[1]
     near = others[near.reshape(len(rows), -1)]
     members, filled = star.members[rows], star.filled[rows]
     known = near == rows[:, None]
@@ -122,7 +122,7 @@ def neighbourhoods(
     order = np.lexsort((far, i))
     i, j = i[order], j[order]
     place = np.arange(len(i)) - np.searchsorted(i, own)[i]
-    kept = place < WIDTH * count
+    kept = place < MOST_WIDTH * count
     width = int(place[kept].max()) + 1
     members = np.zeros((len(points), width), int)
     filled = np.zeros((len(points), width), bool)
@@ -134,7 +134,7 @@ def neighbourhoods(
 def _planes(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> _Planes:
     far, unit = _directions(points, np.arange(len(points)), members, filled)
     nearest = np.where(filled, far, np.inf).min(axis=1, keepdims=True)
-    axes = frames(unit, np.where(filled, nearest / far, 0.0))
+    axes = principal_axes(unit, np.where(filled, nearest / far, 0.0))
     normals = oriented(axes[:, :, 0], unit, members, filled) if points.shape[1] == 3 else None
     return _Planes(points, axes[:, :, -2:], normals)
 
@@ -148,24 +148,26 @@ def _directions(
     return far, np.where(filled[..., None], steps / far[..., None], 0.0)
 
 
-def _unrolled(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> np.ndarray:
+def _in_tangent_planes(
+    planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray
+) -> np.ndarray:
     """Neighbours in the tangent plane: the direction is projected, the distance kept or lengthened.
 
-    It is divided by the cosine of the slope of the step, `STEEP` times over, and likewise where the normals
-    point away from each other: a point on the sheet below is as near as those beside, and must be
+    It is divided by the cosine of the slope of the step, `SLOPE_POWER` times over, and likewise where the
+    normals point away from each other: a point on the sheet below is as near as those beside, and must be
     farther; on a ridge, where there are no others, it stays a neighbour.
     """
     far, unit = _directions(planes.points, rows, members, filled)
     flat = unit @ planes.axes[rows]
     length = np.linalg.norm(flat, axis=2)
-    cosine = np.maximum(length, LEAST)
+    cosine = np.maximum(length, LEAST_COSINE)
     if planes.normals is not None:
         agree = 1 + np.sum(planes.normals[members] * planes.normals[rows][:, None], axis=2)
-        cosine = cosine * np.clip(agree, LEAST, 1.0)
-    return flat * (far / (np.where(length > 0, length, 1.0) * cosine**STEEP))[..., None]
+        cosine = cosine * np.clip(agree, LEAST_COSINE, 1.0)
+    return flat * (far / (np.where(length > 0, length, 1.0) * cosine**SLOPE_POWER))[..., None]
 
 
-def _taken(arrays: tuple[np.ndarray, ...], order: np.ndarray) -> list[np.ndarray]:
+def _reordered(arrays: tuple[np.ndarray, ...], order: np.ndarray) -> list[np.ndarray]:
     """Each row of each array in the order given."""
     return [np.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - 2)), axis=1) for x in arrays]
 
@@ -179,34 +181,34 @@ def _hulls(
     rows = np.arange(len(members))  # those in which something was dropped last time
     while len(rows):
         part, there = flipped[rows], filled[rows]
-        before, after = around(part, there)
+        before, after = cyclic_neighbours(part, there)
         turn = _cross(part - before, after - part)
         size = _norm(part - before) * _norm(after - part)
         # Across half a turn or more there is no triangle that could hide the point.
         opposite = _cross(before, after) <= COCIRCULAR * _norm(before) * _norm(after)
-        dropped = there & ((~opposite & (turn < -COCIRCULAR * size)) | _behind(part, before))
-        dropped |= there & _behind(part, after)
+        dropped = there & ((~opposite & (turn < -COCIRCULAR * size)) | _is_hidden(part, before))
+        dropped |= there & _is_hidden(part, after)
         # A point whose two neighbours are one and the same stays.
         dropped &= (there.sum(axis=1) > 2)[:, None]
         changed = dropped.any(axis=1)
         rows, there = rows[changed], (there & ~dropped)[changed]
         order = np.argsort(~there, axis=1, kind="stable")
-        parts = _taken((members[rows], there, plane[rows], flipped[rows]), order)
+        parts = _reordered((members[rows], there, plane[rows], flipped[rows]), order)
         members[rows], filled[rows], plane[rows], flipped[rows] = parts
     width = int(filled.sum(axis=1).max())
     return members[:, :width], filled[:, :width], plane[:, :width]
 
 
-def around(
+def cyclic_neighbours(
     x: Float[Any, "points width ..."] | Int[Any, "points width"], filled: Bool[Any, "points width"]
 ) -> list[Any]:
     """The entry before and the entry after each, going round; filled entries come first in each row."""
     count = np.maximum(filled.sum(axis=1), 1)[:, None]
     place = np.arange(filled.shape[1])[None, :]
-    return [_taken((x,), (place + shift) % count)[0] for shift in (-1, 1)]
+    return [_reordered((x,), (place + shift) % count)[0] for shift in (-1, 1)]
 
 
-def _behind(x: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _is_hidden(x: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Whether x, inverted, is in the same direction as the other, and was farther away."""
     size = _norm(x) * _norm(other)
     along = (np.abs(_cross(x, other)) <= COCIRCULAR * size) & (np.sum(x * other, axis=-1) > 0)
@@ -223,7 +225,7 @@ def _cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _angles_between(plane: np.ndarray, filled: np.ndarray) -> np.ndarray:
     """Angle from each neighbour to the next; a single neighbour leaves a gap of a full turn."""
-    after = around(plane, filled)[1]
+    after = cyclic_neighbours(plane, filled)[1]
     angle = np.arctan2(_cross(plane, after), np.sum(plane * after, axis=2))
     alone = filled.sum(axis=1, keepdims=True) == 1
     return np.where(filled, np.where(alone, 2 * np.pi, angle % (2 * np.pi)), 0.0)
@@ -239,6 +241,6 @@ def mean_value_weights(star: Stars) -> Float[Any, "points width"]:
     Source: M. S. Floater, Mean value coordinates, Computer Aided Geometric Design 20 (2003).
     """
     half = np.tan(np.minimum(star.angle, WIDEST) / 2)
-    before = around(half[..., None], star.filled)[0][..., 0]
+    before = cyclic_neighbours(half[..., None], star.filled)[0][..., 0]
     far = np.linalg.norm(star.plane, axis=2)
     return np.where(star.filled, (before + half) / np.where(star.filled, far, 1.0), 0.0)

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._host_splines import Frame
+from jaxfit._base._host_splines import GridEvaluator
 
-AT_ONCE = 4_000_000  # pairs of grid point and cloud point in memory
-PRESENCE = 0.25  # the sum of weights at which the confidence is 1/2; one point on the normal line has 1
-NEAREST = 8  # cloud points whose mean distance bounds the reach
-NARROWEST = 0.3  # of the median: the least spacing of a grid that counts
-FINEST = 1e-9  # of the diagonal: the least reach
+PAIRS_PER_BLOCK = 4_000_000  # pairs of grid point and cloud point in memory
+# The sum of weights at which the confidence is 1/2; one point on the normal line has 1.
+HALF_CONFIDENCE = 0.25
+NEIGHBOURS = 8  # cloud points whose mean distance bounds the reach
+LEAST_SPACING = 0.3  # of the median: the least spacing of a grid that counts
+LEAST_REACH = 1e-9  # of the diagonal: the least reach
 SAMPLES = 160  # along each direction, to measure distances
 
 
@@ -33,7 +34,7 @@ def directed_projection(
     counts most. Where no point is near the line the confidence falls to 0, and t has no meaning.
     """
     moves, sure = np.zeros(len(grid)), np.zeros(len(grid))
-    step = max(1, AT_ONCE // max(len(points), 1))
+    step = max(1, PAIRS_PER_BLOCK // max(len(points), 1))
     squares = np.sum(points**2, axis=1)
     for start in range(0, len(grid), step):
         part = slice(start, start + step)
@@ -45,7 +46,7 @@ def directed_projection(
         total = weight.sum(axis=1)
         moves[part] = np.sum(weight * along, axis=1) / np.where(total > 0, total, 1.0)
         sure[part] = near.sum(axis=1)
-    return moves, sure / (sure + PRESENCE)
+    return moves, sure / (sure + HALF_CONFIDENCE)
 
 
 def reach_of(grid: Float[Any, "a b 3"], points: Float[Any, "points 3"], share: float) -> Float[Any, "a b"]:
@@ -58,10 +59,10 @@ def reach_of(grid: Float[Any, "a b 3"], points: Float[Any, "points 3"], share: f
 
     rows, columns = (np.linalg.norm(np.gradient(grid, axis=k), axis=2) for k in (0, 1))
     spacing = share * np.sqrt((rows**2 + columns**2) / 2)
-    spacing = np.maximum(spacing, NARROWEST * np.median(spacing))
-    nearest = cKDTree(points).query(grid.reshape(-1, 3), min(NEAREST, len(points)))[0]
+    spacing = np.maximum(spacing, LEAST_SPACING * np.median(spacing))
+    nearest = cKDTree(points).query(grid.reshape(-1, 3), min(NEIGHBOURS, len(points)))[0]
     distance = nearest.reshape(*spacing.shape, -1).mean(axis=2)
-    return np.maximum(np.minimum(spacing, distance), FINEST)
+    return np.maximum(np.minimum(spacing, distance), LEAST_REACH)
 
 
 def mean_distance(
@@ -74,8 +75,8 @@ def mean_distance(
     from scipy.spatial import cKDTree
 
     ends = [np.linspace(t[0], t[-1], SAMPLES) for t in knots]
-    frame = Frame(knots, order, *ends)
-    grid, normals = frame.points(net), frame.normals(net).reshape(-1, 3)
+    evaluator = GridEvaluator(knots, order, *ends)
+    grid, normals = evaluator.points(net), evaluator.normals(net).reshape(-1, 3)
     steps = [np.linalg.norm(np.diff(grid, axis=k), axis=2).mean() for k in (0, 1)]
     samples = grid.reshape(-1, 3)
     distance, nearest = cKDTree(samples).query(points)

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from jaxfit._base._base_method import AbstractBaseMethod
 from jaxfit._base._directed_projection import directed_projection, mean_distance, reach_of
 from jaxfit._base._grid_smoothing import smoothed
-from jaxfit._base._host_splines import Frame, Knots, along_both, basis_matrix
+from jaxfit._base._host_splines import GridEvaluator, Knots, along_both, basis_matrix
 from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
 from jaxfit._splines._knots import greville
 
-GAIN = 0.01  # a mean distance has fallen if it did so by this share
-IDLE = 2  # grids that lower nothing before the end
+LEAST_GAIN = 0.01  # a mean distance has fallen if it did so by this share
+MOST_IDLE_LEVELS = 2  # grids that lower nothing before the end
 
 
 class DynamicBaseSurface(AbstractBaseMethod):
@@ -114,10 +114,10 @@ class DynamicBaseSurface(AbstractBaseMethod):
         rows = (self.start, self.start)
         most = tuple(len(t) - 2 * k for t, k in zip(knots, order, strict=True))
         idle = 0
-        while idle < IDLE:
+        while idle < MOST_IDLE_LEVELS:
             rows = (min(rows[0], most[0]), min(rows[1], most[1]))
             found, distance = self._level(_Level(net, knots, order, rows), best, points)
-            idle = 0 if distance < least * (1 - GAIN) else idle + 1
+            idle = 0 if distance < least * (1 - LEAST_GAIN) else idle + 1
             if distance < least:
                 least, best = distance, found
             if rows == most:
@@ -129,7 +129,7 @@ class DynamicBaseSurface(AbstractBaseMethod):
         """The nearest net of rounds on one grid, and its mean distance."""
         least, best = np.inf, net
         for _ in range(self.rounds):
-            grid, normals = level.frame.points(net), level.frame.normals(net)
+            grid, normals = level.evaluator.points(net), level.evaluator.normals(net)
             reach = reach_of(grid, points, self.reach)
             moves, sure = directed_projection(
                 grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points
@@ -137,7 +137,7 @@ class DynamicBaseSurface(AbstractBaseMethod):
             moved = grid - level.base + moves.reshape(reach.shape)[..., None] * normals
             net = level.interpolated(smoothed(moved, sure.reshape(reach.shape), self.stiffness))
             distance = mean_distance(net, level.knots, level.order, points)
-            fell = distance < least * (1 - GAIN)
+            fell = distance < least * (1 - LEAST_GAIN)
             if distance < least:
                 least, best = distance, net
             if not fell:
@@ -160,8 +160,8 @@ class _Level:
             raised = np.linalg.solve(basis_matrix(t, k, all_at), basis_matrix(few, k, all_at))
             self._lift.append(raised @ own)
             places.append(at)
-        self.frame = Frame(knots, order, *places)
-        self.base = self.frame.points(coons)
+        self.evaluator = GridEvaluator(knots, order, *places)
+        self.base = self.evaluator.points(coons)
 
     def interpolated(self, displacements: np.ndarray) -> np.ndarray:
         """The Coons net plus the spline through the displacements, whose border is zero."""

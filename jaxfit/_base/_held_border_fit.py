@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from jaxfit._base._host_splines import Knots, basis_matrix
 
-GROSS = 20.0  # times the median residual: where a point has half its weight
-LEAST = 1e-9  # of the diagonal: a residual this small is rounding
-SPECK = 1e-13  # of the mean diagonal entry
+OUTLIER_RATIO = 20.0  # times the median residual: where a point has half its weight
+LEAST_RESIDUAL = 1e-9  # of the diagonal: a residual this small is rounding
+REGULARISATION = 1e-13  # of the mean diagonal entry
 
 
 def _tensor_rows(first: Any, second: Any) -> Any:
@@ -77,7 +77,7 @@ class HeldBorderFit:
         net = self.net(weights, smoothing)
         for _ in range(rounds):
             residual = np.linalg.norm(self._rows @ net.reshape(-1, net.shape[2]) - self.points, axis=1)
-            usual = max(GROSS * float(np.median(residual)), LEAST)
+            usual = max(OUTLIER_RATIO * float(np.median(residual)), LEAST_RESIDUAL)
             weights = 1 / (1 + (residual / usual) ** 2)
             net = self.net(weights, smoothing)
         return net, weights
@@ -98,10 +98,10 @@ class HeldBorderFit:
         flat = self._border.reshape(-1, d).copy()
         right = (self._rows.T @ (weights[:, None] * self.points))[free] - system[free][:, held] @ flat[held]
         # Where the plate has no bending (order 2) it leaves a control point without points undecided.
-        speck = SPECK * self._trace / len(flat)
-        inner = system[free][:, free] + speck * diags_array(np.ones(len(free)))
+        shift = REGULARISATION * self._trace / len(flat)
+        inner = system[free][:, free] + shift * diags_array(np.ones(len(free)))
         # Positive definite: no pivots off the diagonal, whose fill may cost twenty times as much.
         options = {"SymmetricMode": True}
         factors = splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-        flat[free] = factors.solve(right + speck * flat[free])
+        flat[free] = factors.solve(right + shift * flat[free])
         return flat.reshape(nu, nv, d)

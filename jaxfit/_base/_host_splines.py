@@ -24,7 +24,7 @@ def along_both(
     return np.swapaxes(np.tensordot(second, np.tensordot(first, net, 1), (1, 1)), 0, 1)
 
 
-class Frame:
+class GridEvaluator:
     """Points and normals of the surfaces of one spline space, on one grid of parameters."""
 
     def __init__(self, knots: Knots, order: tuple[int, int], u: np.ndarray, v: np.ndarray):

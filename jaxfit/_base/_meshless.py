@@ -15,7 +15,7 @@ from jaxfit._base._unfolding import unfolded
 from jaxfit._checks import check_number
 
 FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
-STIFFENINGS = 12  # most rises of the smoothing
+MOST_RISES = 12  # most rises of the smoothing
 
 
 class Meshless(AbstractBaseMethod):
@@ -110,7 +110,7 @@ class Meshless(AbstractBaseMethod):
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
         most = FARTHEST * max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
         fit = HeldBorderFit(net, knots, order, places, points)
-        for power in range(STIFFENINGS):
+        for power in range(MOST_RISES):
             smoothing = self.smoothing * 10.0**power
             found, weights = fit.robust_weights(smoothing, self.robust)
             if np.linalg.norm(found, axis=-1).max() <= most:

@@ -14,9 +14,9 @@ from jaxfit._base._parametric_stretch import area_stretch, link_weights
 from jaxfit._checks import as_points, check_kind, check_number, eager_where_concrete, is_concrete
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
-APART = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
-PINNED = 1e-9  # a point this near a node of the boundary (times the diagonal) is that node
-UNLINKINGS = 6  # rounds in which links that stay long lose weight
+NODE_SPACING = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
+COINCIDENT = 1e-9  # a point this near a node of the boundary (times the diagonal) is that node
+LINK_ROUNDS = 6  # rounds in which links that stay long lose weight
 
 
 class _Nodes(NamedTuple):
@@ -119,7 +119,7 @@ def parameters_of(
     star = stars(nodes.points, neighbours, fixed)
     weights = mean_value_weights(star)
     places = _solved(nodes, star, weights)
-    for _ in range(UNLINKINGS):
+    for _ in range(LINK_ROUNDS):
         cut = link_weights(star, nodes.points, places)
         if (cut == 1).all():
             break
@@ -150,7 +150,7 @@ def _nodes(points: np.ndarray, sides: list[np.ndarray]) -> _Nodes:
         places.append(np.stack([along, across] if k < 2 else [across, along], axis=1))
     whole, place = np.concatenate(rims), np.concatenate(places)
     far, nearest = cKDTree(whole).query(points)
-    away = far > PINNED
+    away = far > COINCIDENT
     kept = np.arange(len(whole))
     if away.any():
         parts = np.split(cKDTree(points[away]).query(whole)[0], np.cumsum([len(x) for x in rims[:-1]]))
@@ -164,7 +164,7 @@ def _spaced(rim: np.ndarray, room: np.ndarray) -> np.ndarray:
     arc, kept = chord_lengths(rim), np.zeros(len(rim), bool)
     kept[[0, -1]], last = True, 0
     for k in range(1, len(rim) - 1):
-        if arc[k] - arc[last] >= APART * room[k]:
+        if arc[k] - arc[last] >= NODE_SPACING * room[k]:
             kept[k], last = True, k
     return kept
 
@@ -197,7 +197,7 @@ def _connect_components(graph: Any, points: np.ndarray, fixed: int) -> Any:
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    lost = ~_reaching(graph, fixed)
+    lost = ~_is_connected_to_boundary(graph, fixed)
     if not lost.any():
         return graph
     rows, rest = np.flatnonzero(lost), np.flatnonzero(~lost)
@@ -212,7 +212,7 @@ def _connect_components(graph: Any, points: np.ndarray, fixed: int) -> Any:
     return graph + both + csr_array(links, shape=graph.shape)
 
 
-def _reaching(graph: Any, fixed: int) -> np.ndarray:
+def _is_connected_to_boundary(graph: Any, fixed: int) -> np.ndarray:
     """Whether a path along the neighbours leads from each point to the boundary."""
     from scipy.sparse import csr_array, vstack
     from scipy.sparse.csgraph import breadth_first_order

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._delaunay_stars import WIDEST, Stars, around
+from jaxfit._base._delaunay_stars import WIDEST, Stars, cyclic_neighbours
 
 LONGEST = 4.0  # times the median length in the domain per length in space; longer links count less
 STEEPEST = 5.0  # times the median: the most that a stretch counts in one reweighting
@@ -21,7 +21,7 @@ def area_stretch(
     each triangle (Sander et al. 2001): a single triangle turned over, as stars that do not quite agree
     contain, would outweigh all others. The first `fixed` points and those without area have 1.
     """
-    after = around(star.members, star.filled)[1]
+    after = cyclic_neighbours(star.members, star.filled)[1]
     inside = star.filled & (star.angle < WIDEST)
     steps, sides = points[star.members] - points[:, None], points[after] - points[:, None]
     square = np.sum(steps**2, axis=2) * np.sum(sides**2, axis=2) - np.sum(steps * sides, axis=2) ** 2

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 PLANES = 3  # times the plane is laid; each time, steps out of the last one count less
 
 
-def frames(
+def principal_axes(
     unit: Float[Any, "points width d"], weight: Float[Any, "points width"]
 ) -> Float[Any, "points d d"]:
     """Principal axes of the weighted unit directions to the neighbours, as columns, the normal first.

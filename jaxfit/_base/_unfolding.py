@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit._base._held_border_fit import HeldBorderFit
-from jaxfit._base._host_splines import Frame, Knots
+from jaxfit._base._host_splines import GridEvaluator, Knots
 
-TURN = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
-CREASED = -0.8  # the same for order 2, whose surfaces may have sharp edges at all knots
+LEAST_COSINE = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
+LEAST_COSINE_CREASED = -0.8  # the same for order 2, whose surfaces may have sharp edges at all knots
 SAMPLES = 200  # at least so many in all along u and along v,
-IN_A_CELL = 4  # and in every cell
-LOSS = 0.1  # what is left of the weight of a point near a fold, each time
+SAMPLES_A_CELL = 4  # and in every cell
+WEIGHT_FACTOR = 0.1  # what is left of the weight of a point near a fold, each time
 ROUNDS = 8  # at most
-IDLE = 3  # rounds in a row without fewer folds before the end
+MOST_IDLE_ROUNDS = 3  # rounds in a row without fewer folds before the end
 
 
 def unfolded(
@@ -33,31 +33,31 @@ def unfolded(
         for x, places in zip(breaks, fit.places.T, strict=True)
     ]
     reach = np.zeros([len(x) - 1 for x in breaks], int)
-    cells, count = folds(net, fit.knots, fit.order)
+    cells, count = folded_cells(net, fit.knots, fit.order)
     best, fewest, idle = net, count, 0
     for _ in range(ROUNDS):
-        if count == 0 or idle == IDLE:
+        if count == 0 or idle == MOST_IDLE_ROUNDS:
             break
         reach += cells
         near = _surroundings(np.where(cells, reach, 0))
-        weights = np.where(near[inside[0], inside[1]], LOSS * weights, weights)
+        weights = np.where(near[inside[0], inside[1]], WEIGHT_FACTOR * weights, weights)
         net = fit.net(weights, smoothing)
-        cells, count = folds(net, fit.knots, fit.order)
+        cells, count = folded_cells(net, fit.knots, fit.order)
         idle = 0 if count < fewest else idle + 1
         if count < fewest:
             best, fewest = net, count
     return best
 
 
-def folds(
+def folded_cells(
     net: Float[Any, "nu nv 3"], knots: Knots, order: tuple[int, int]
 ) -> tuple[Bool[Any, "cells_u cells_v"], int]:
     """The cells where the normal turns too far between neighbouring samples, and how many pairs there are."""
     breaks = [np.unique(t) for t in knots]
     samples, cell = zip(*(_samples(x) for x in breaks), strict=True)
-    normals = Frame(knots, order, *samples).normals(net)
+    normals = GridEvaluator(knots, order, *samples).normals(net)
     cells = np.zeros([len(x) - 1 for x in breaks], bool)
-    turn_u, turn_v = (CREASED if k == 2 else TURN for k in order)
+    turn_u, turn_v = (LEAST_COSINE_CREASED if k == 2 else LEAST_COSINE for k in order)
     along_u = np.argwhere(np.sum(normals[1:] * normals[:-1], axis=2) < turn_u)
     along_v = np.argwhere(np.sum(normals[:, 1:] * normals[:, :-1], axis=2) < turn_v)
     for pairs, step in ((along_u, (1, 0)), (along_v, (0, 1))):
@@ -69,7 +69,7 @@ def folds(
 def _samples(breaks: Float[Any, " breaks"]) -> tuple[np.ndarray, np.ndarray]:
     """Parameters from end to end, equally many in every span, and the numbers of their spans."""
     spans = len(breaks) - 1
-    each = max(IN_A_CELL, -(-SAMPLES // spans))
+    each = max(SAMPLES_A_CELL, -(-SAMPLES // spans))
     share = np.arange(each) / each
     inner = (breaks[:-1, None] + np.diff(breaks)[:, None] * share).ravel()
     return np.append(inner, breaks[-1]), np.append(np.repeat(np.arange(spans), each), spans - 1)

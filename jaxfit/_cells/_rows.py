@@ -118,17 +118,17 @@ def sort_by_cell(
     points = cell.shape[0]
     bits = max(points - 1, 1).bit_length()
     number = jnp.arange(points, dtype=jnp.int32)
-    word = _word(bits + cells.bit_length())
+    packed_type = _packed_type(bits + cells.bit_length())
     cell = jnp.minimum(cell, cells)
-    if word is None:
+    if packed_type is None:
         ordered, order = lax.sort((cell.astype(jnp.int32), number), num_keys=1, is_stable=True)
         return ordered, order
-    packed = jnp.sort((cell.astype(word) << bits) | number.astype(word))
-    mask = jnp.asarray((1 << bits) - 1, word)
+    packed = jnp.sort((cell.astype(packed_type) << bits) | number.astype(packed_type))
+    mask = jnp.asarray((1 << bits) - 1, packed_type)
     return (packed >> bits).astype(jnp.int32), (packed & mask).astype(jnp.int32)
 
 
-def _word(bits: int):
+def _packed_type(bits: int):
     """The unsigned integer type with this many bits, if there is one at the current precision."""
     if bits <= 32:
         return jnp.uint32

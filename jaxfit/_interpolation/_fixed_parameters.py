@@ -90,7 +90,7 @@ class Chebyshev(AbstractAcceleration):
         return move, (centre, radius, move, following)
 
 
-class System(eqx.Module):
+class FrozenSystem(eqx.Module):
     """What stays the same while the feet are held."""
 
     collocation: PointCollocation
@@ -104,7 +104,7 @@ class System(eqx.Module):
 def iterate_frozen(
     method: Any,
     limits: Tolerances,
-    system: System,
+    system: FrozenSystem,
     most: Array,
     net: Float[Array, "nu nv d"],
     first: Array,

@@ -21,7 +21,7 @@ def bounds_between(
     """Least and greatest (u, v) of each foot of a grid whose first feet are `u` and `v`."""
     along_u = _middles(u.reshape(nu, nv))
     along_v = _middles(v.reshape(nu, nv).T).swapaxes(1, 2)
-    return _module(u, v).stack([along_u, along_v], axis=1).reshape(2, 2, nu * nv)
+    return _array_module(u, v).stack([along_u, along_v], axis=1).reshape(2, 2, nu * nv)
 
 
 def is_within(feet: Float[Any, "2 points"], bounds: Float[Any, "2 2 points"]) -> Bool[Any, " points"]:
@@ -31,10 +31,10 @@ def is_within(feet: Float[Any, "2 points"], bounds: Float[Any, "2 2 points"]) ->
 
 def _middles(x: Any) -> Any:
     """Between each row and the one before, and the one after; infinite where there is none."""
-    xp = _module(x)
+    xp = _array_module(x)
     middle, none = 0.5 * (x[1:] + x[:-1]), xp.full_like(x[:1], np.inf)
     return xp.stack([xp.concatenate([-none, middle]), xp.concatenate([middle, none])])
 
 
-def _module(*arrays: Any) -> Any:
+def _array_module(*arrays: Any) -> Any:
     return np if is_concrete(arrays) else jnp

@@ -21,7 +21,12 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
-from jaxfit._interpolation._fixed_parameters import AbstractAcceleration, Richardson, System, iterate_frozen
+from jaxfit._interpolation._fixed_parameters import (
+    AbstractAcceleration,
+    FrozenSystem,
+    Richardson,
+    iterate_frozen,
+)
 from jaxfit._interpolation._foot_bounds import bounds_between, is_within
 from jaxfit._interpolation._geometric_fit import geometric_fit
 from jaxfit._interpolation._method import (
@@ -37,7 +42,7 @@ from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
 
 
-class GeometricState(eqx.Module):
+class GeometricInterpolationState(eqx.Module):
     """The feet of the next move, and their bounds; the surface with the smallest maximum error so far; feet
     before the first moves, which derivatives replay (NaN where there are none, or where the foot has stayed);
     and the smallest eigenvalue of the collocation matrix, where a choice of the method asks for it.
@@ -186,7 +191,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
 
     def init(
         self, problem: Problem, surface: WorkingSurface, projection: Projection
-    ) -> tuple[WorkingSurface, GeometricState]:
+    ) -> tuple[WorkingSurface, GeometricInterpolationState]:
         """Nothing is known yet; whoever needs the eigenvalue sets it."""
         xp: Any = np if is_concrete(problem) else jnp
         far = xp.asarray(np.inf, problem.target.dtype)
@@ -194,12 +199,16 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         path = np.full((0 if moves is None else moves + 1, 2, problem.target.shape[1]), np.nan, far.dtype)
         feet = xp.stack([projection.u, projection.v])
         bounds = bounds_between(projection.u, projection.v, *surface.control_points.shape[:2])
-        return surface, GeometricState(feet, bounds, surface, projection, far, path, xp.ones_like(far))
+        return surface, GeometricInterpolationState(
+            feet, bounds, surface, projection, far, path, xp.ones_like(far)
+        )
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
+    def measure(
+        self, problem: Problem, iterate: Iterate, exact: Array
+    ) -> tuple[Projection, GeometricInterpolationState]:
         """Closest points from the last feet, which stay where a closest point is out of bounds."""
         surface = iterate.surface
-        state: GeometricState = iterate.state
+        state: GeometricInterpolationState = iterate.state
         nu, nv = surface.control_points.shape[:2]
         held = corners(nu, nv).reshape(-1)
         within = side_bounds(surface.axes, nu, nv) if self.keep_borders else None
@@ -220,7 +229,9 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         feet = jnp.where(within, feet, state.feet)
         parts = ((surface, here, maximum), (state.best, state.projection, state.maximum))
         *best, least = jax.tree.map(lambda x, y: lax.select(maximum < state.maximum, x, y), *parts)
-        return here, GeometricState(feet, state.bounds, best[0], best[1], least, path, state.lowest)
+        return here, GeometricInterpolationState(
+            feet, state.bounds, best[0], best[1], least, path, state.lowest
+        )
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new iterate: errors may rise on the way."""
@@ -234,7 +245,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         collocation = point_collocation(surface.axes, *iterate.state.feet.reshape(2, nu, nv))
         lowest = iterate.state.lowest
         weight = self.repositioning.weights(collocation, lowest)
-        system = System(collocation, target, weight, corners(nu, nv), lowest, problem.diagonal)
+        system = FrozenSystem(collocation, target, weight, corners(nu, nv), lowest, problem.diagonal)
         if self.freeze_after is None:
             most = jnp.ones_like(iterate.step)
         else:
@@ -248,7 +259,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         self, problem: Problem, iterate: Iterate, stopped_early: Array
     ) -> tuple[Iterate, dict[str, Any]]:
         """The best surface, if the errors have stopped falling before the end."""
-        state: GeometricState = iterate.state
+        state: GeometricInterpolationState = iterate.state
         found = (state.best, state.projection)
         early = stopped_early & jnp.isfinite(state.maximum)
         surface, projection = jax.tree.map(

@@ -17,11 +17,12 @@ from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._adjoints import ImplicitAdjoint
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
-from jaxfit._interpolation._linear_finish import has_stalled, impatient, solved_at_grid
+from jaxfit._interpolation._linear_finish import has_stalled, solved_at_grid, with_larger_stall_gain
 from jaxfit._interpolation._method import (
     CORNERS,
     Frame,
     GridProblem,
+    Pair,
     Progress,
     Solution,
     errors_only,
@@ -31,8 +32,6 @@ from jaxfit._interpolation._method import (
 from jaxfit._interpolation._repositioning import lowest_eigenvalue
 from jaxfit._parameters import AbstractParametrisation, grid_parameters
 from jaxfit._splines import Reflection, averaging_knots
-
-Pair = tuple[Any, Any]
 
 
 class Start(eqx.Module):
@@ -45,7 +44,7 @@ class Start(eqx.Module):
 
 
 @partial(compiled, static_argnums=(0, 1, 2, 3))
-def started(
+def make_start(
     parametrisation: AbstractParametrisation,
     per_point: bool,
     order: tuple[int, int],
@@ -82,7 +81,7 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
         data = np.asarray(data) if concrete else data
         frame = dataclasses.replace(frame, corners=frame.outward(data[CORNERS]))
     axis = None if symmetry is None else symmetry.axis
-    start = started(method.parametrisation, method.per_point, problem.order, axis, data)
+    start = make_start(method.parametrisation, method.per_point, problem.order, axis, data)
     if concrete:
         start = jax.tree.map(np.asarray, start)
         _check(method, data, start, symmetry)
@@ -91,7 +90,7 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
     inputs = FitInputs(
         data, start.knots, start.averaged, start.feet, frame.diagonal, frame.goal, foot_tolerance
     )
-    how = impatient(method) if concrete and method.solve_stalled else method
+    how = with_larger_stall_gain(method) if concrete and method.solve_stalled else method
     loop = _iterated(how, lax.stop_gradient(inputs) if not concrete else inputs, frame.max_steps, progress)
     end, shape = loop.current, data.shape[:2]
     net, here = end.surface.control_points, end.projection

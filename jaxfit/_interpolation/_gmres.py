@@ -14,7 +14,7 @@ Operator = Callable[[Array], Array]
 SLOW = 0.9  # a cycle that leaves more of the largest error than this is the last
 
 
-class Limits(eqx.Module):
+class GmresLimits(eqx.Module):
     """When to stop: errors are lengths over `diagonal`, cycles are counted in the history."""
 
     diagonal: Array
@@ -39,7 +39,7 @@ def gmres_solve(
     x: Float[Array, "n m d"],
     step: Array,
     history: ErrorHistory,
-    limits: Limits,
+    limits: GmresLimits,
     restart: int,
 ) -> tuple[Array, Array, ErrorHistory]:
     """Cycles from `x`, whose errors are those of `step` in `history`, until the largest error is within the

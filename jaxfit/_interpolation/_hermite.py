@@ -96,8 +96,8 @@ class NormalInterpolation(AbstractDirectInterpolation):
         normals = normals / jnp.where(lengths > 0, lengths, 1.0)
         parameters = grid_parameters(data, self.parametrisation)
         u, v = parameters.u, parameters.v
-        tangent_u = _flattened(slopes(u, order[0], data, 0), normals)
-        tangent_v = _flattened(slopes(v, order[1], data, 1), normals)
+        tangent_u = _tangential_part(slopes(u, order[0], data, 0), normals)
+        tangent_v = _tangential_part(slopes(v, order[1], data, 1), normals)
         twist = 0.5 * (slopes(v, order[1], tangent_u, 1) + slopes(u, order[0], tangent_v, 0))
         given = interleaved(interleaved(data, tangent_u, 0), interleaved(tangent_v, twist, 0), 1)
         twice = (averaging_knots(jnp.repeat(t, 2), k) for t, k in zip((u, v), order, strict=True))
@@ -105,8 +105,8 @@ class NormalInterpolation(AbstractDirectInterpolation):
         tensor = tensor_collocation(knots, order, u, v, (0, 1))
         net = tensor.solve(given)
         # What the surface takes there, as it stands: values, derivatives along u and along v.
-        on_rows, across_rows = parted(lax.stop_gradient(tensor.times(net)), 1)
-        (values, derivative_u), (derivative_v, _) = parted(on_rows, 0), parted(across_rows, 0)
+        on_rows, across_rows = deinterleaved(lax.stop_gradient(tensor.times(net)), 1)
+        (values, derivative_u), (derivative_v, _) = deinterleaved(on_rows, 0), deinterleaved(across_rows, 0)
         errors = distances(lax.stop_gradient(data) - values, frame.diagonal)
         angles = angles_between(jnp.cross(derivative_u, derivative_v), lax.stop_gradient(normals))
         worst = jnp.max(angles)
@@ -157,7 +157,7 @@ def slopes(u: Array, order: int, values: Float[Array, "n m d"], axis: int) -> Fl
     return banded.times(banded.collocation_band(knots, order, u, (1,)), net, axis=axis)
 
 
-def _flattened(tangent: Array, normals: Array) -> Array:
+def _tangential_part(tangent: Array, normals: Array) -> Array:
     """The tangents' parts in the planes across the normals."""
     return tangent - jnp.sum(tangent * normals, axis=-1, keepdims=True) * normals
 
@@ -170,7 +170,7 @@ def interleaved(first: Array, second: Array, axis: int) -> Array:
     return jnp.moveaxis(pairs.reshape(-1, *first.shape[1:]), 0, axis)
 
 
-def parted(both: Array, axis: int) -> Pair:
+def deinterleaved(both: Array, axis: int) -> Pair:
     """Values and derivatives, the inverse of `interleaved`."""
     rows = jnp.moveaxis(both, axis, 0)
     pairs = rows.reshape(-1, 2, *rows.shape[1:])

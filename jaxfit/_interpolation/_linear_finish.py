@@ -16,19 +16,17 @@ from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._loop import LoopState
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._interpolation._gmres import append_errors, distances
-from jaxfit._interpolation._method import Frame, Solution, errors_only
+from jaxfit._interpolation._method import Frame, Pair, Solution, errors_only
 from jaxfit._interpolation._tensor_collocation import tensor_collocation
 from jaxfit._splines import Reflection
-
-Pair = tuple[Any, Any]
 
 # Errors that fall by less than this share in 40 iterations need more than 600 for nine orders of magnitude.
 LEAST_GAIN = 0.75
 ROUNDING = 16  # rounding units of the diagonal: the linear system would leave errors of this size, too
 
 
-def impatient(method: Any) -> Any:
-    """`method`, stopped earlier where it is slow, since the linear system can take its place."""
+def with_larger_stall_gain(method: Any) -> Any:
+    """`method`, but a slow fit counts as stalled sooner, since the linear system can take over."""
     return dataclasses.replace(method, stall_gain=max(method.stall_gain, LEAST_GAIN))
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ from jaxfit._fit._history import (
     public_history,
     without_counts,
 )
+from jaxfit._fit._loop import Progress
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit
 from jaxfit._fit._scaling import Outward
@@ -31,7 +31,6 @@ from jaxfit._precision import bucket
 from jaxfit._splines import BSplineSurface
 
 Pair = tuple[Any, Any]
-Progress = Callable[[int, int, float, float], None]
 
 CORNERS = np.asarray([[0], [-1]]), np.asarray([[0, -1]])  # rows and columns
 

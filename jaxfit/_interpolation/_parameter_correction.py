@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxfit._closest import Newton, project
 from jaxfit._fit._feet import FOOT_STEPS
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._interpolation._gmres import Limits, append_errors, distances, gmres_solve
+from jaxfit._interpolation._gmres import GmresLimits, append_errors, distances, gmres_solve
 from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._solution_derivative import times_last
 from jaxfit._interpolation._tensor_collocation import TensorCollocation
@@ -24,7 +24,7 @@ class CollocationProblem(eqx.Module):
     knots: tuple[Array, Array]
     axes: tuple[Axis, Axis]
     tensor: TensorCollocation
-    limits: Limits
+    limits: GmresLimits
 
     def system(self, u: Array, v: Array) -> PointCollocation:
         """The collocation matrix at the parameters (u, v) of every point."""

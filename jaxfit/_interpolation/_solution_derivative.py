@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._interpolation._gmres import Limits, Operator, append_errors, distances, gmres_solve
+from jaxfit._interpolation._gmres import GmresLimits, Operator, append_errors, distances, gmres_solve
 from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._tensor_collocation import TensorCollocation
 from jaxfit._splines._pieces import Axis
@@ -59,7 +59,7 @@ def _to_rounding(apply: Operator, precondition: Operator, right: Array, restart:
     one = jnp.ones((), right.dtype)
     errors = distances(right, one)
     tolerance = 100 * jnp.finfo(right.dtype).eps * jnp.max(errors)
-    limits = Limits(one, tolerance, jnp.asarray(jnp.iinfo(jnp.int32).max))
+    limits = GmresLimits(one, tolerance, jnp.asarray(jnp.iinfo(jnp.int32).max))
     zero, nothing = jnp.zeros((), jnp.int32), jnp.zeros_like(right)
     empty = ErrorHistory(jnp.zeros((4, 1), right.dtype), jnp.zeros((3, 1), jnp.int32), one)
     history = append_errors(empty, zero, errors)

@@ -9,7 +9,7 @@ from jax import Array, lax
 from jaxfit._checks import check_kind, check_number
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._reasons import RESULTS, code_of
-from jaxfit._interpolation._gmres import Limits, distances
+from jaxfit._interpolation._gmres import GmresLimits, distances
 from jaxfit._interpolation._method import (
     AbstractDirectInterpolation,
     GridProblem,
@@ -115,7 +115,7 @@ class StandardInterpolation(AbstractDirectInterpolation):
         else:
             u = jnp.broadcast_to(averaged[0][:, None], data.shape[:2])
             v = jnp.broadcast_to(averaged[1][None, :], data.shape[:2])
-        limits = Limits(frame.diagonal, frame.goal, frame.max_steps)
+        limits = GmresLimits(frame.diagonal, frame.goal, frame.max_steps)
         if self.iterative:
             axes = make_axis(knots[0], order[0], simple=True), make_axis(knots[1], order[1], simple=True)
             system = CollocationProblem(data, knots, axes, tensor, limits)

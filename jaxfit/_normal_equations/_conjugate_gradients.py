@@ -11,7 +11,7 @@ Operator = Callable[[Array], Array]
 State = tuple[Array, Array, Array, Array, Array]
 
 
-class Solution(NamedTuple):
+class CGSolution(NamedTuple):
     """An approximate solution, the residual that it leaves, and whether the tolerance is met."""
 
     net: Float[Array, "nu nv c"]
@@ -27,7 +27,7 @@ def conjugate_gradients(
     rtol: float,
     max_steps: int,
     coupled: bool,
-) -> Solution:
+) -> CGSolution:
     """Solves a positive semidefinite system from 0.
 
     Stops where the residual, in the norm of the preconditioner, is `rtol` times the right-hand side, after
@@ -57,7 +57,7 @@ def conjugate_gradients(
     goal = rtol**2 * slope
     begin = (jnp.zeros_like(right), right, first, slope, jnp.asarray(0, jnp.int32))
     net, left, _, slope, steps = lax.while_loop(unfinished, step, begin)
-    return Solution(net, left, jnp.all(slope <= goal) & jnp.all(jnp.isfinite(left)), steps)
+    return CGSolution(net, left, jnp.all(slope <= goal) & jnp.all(jnp.isfinite(left)), steps)
 
 
 def _ratio(x: Array, y: Array) -> Array:

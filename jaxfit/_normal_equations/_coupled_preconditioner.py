@@ -6,7 +6,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._normal_equations._block_cholesky import Factors, factorise, substitute
-from jaxfit._normal_equations._conjugate_gradients import Solution, conjugate_gradients
+from jaxfit._normal_equations._conjugate_gradients import CGSolution, conjugate_gradients
 from jaxfit._normal_equations._coupled_stencil import CoupledStencil
 from jaxfit._normal_equations._stencil import Stencil
 
@@ -55,7 +55,7 @@ def solve_coupled(
     preconditioner: CoupledPreconditioner,
     rtol: float,
     max_steps: int,
-) -> Solution:
+) -> CGSolution:
     """The solution on the free control points, 0 elsewhere, by conjugate gradients."""
     inside = free[:, :, None]
 

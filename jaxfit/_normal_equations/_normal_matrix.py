@@ -14,7 +14,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._cells import Rows, overlap_add, row_moments
-from jaxfit._normal_equations._stencil import Stencil, windows
+from jaxfit._normal_equations._stencil import Stencil, shifted_slices
 from jaxfit._splines._pieces import Axis
 
 # On a CPU, powers and moments of so many points stay in a core's caches. Elsewhere all go at once.
@@ -81,7 +81,7 @@ def basis_products(axis: Axis) -> Float[Any, "cells K K moments"]:
     order = _order(axis)
     xp: Any = np if isinstance(basis, np.ndarray) else jnp
     shifted = xp.pad(basis, ((0, 0), (0, order - 1), (0, 0)))
-    neighbours = xp.moveaxis(windows(shifted, order, order, 1), 0, 2)
+    neighbours = xp.moveaxis(shifted_slices(shifted, order, order, 1), 0, 2)
     return overlap_add(xp.moveaxis(basis, 2, 0)[:, :, :, None, None] * neighbours[None], -1)
 
 

@@ -82,7 +82,7 @@ def shifted_products(
     return lax.scan(add, none, (stored, a, b))[0]
 
 
-def windows(x: Any, count: int, size: int, axis: int) -> Any:
+def shifted_slices(x: Any, count: int, size: int, axis: int) -> Any:
     """`size` entries along `axis` from each of the first `count` places, along a new first axis."""
     if isinstance(x, np.ndarray):
         return np.stack([np.take(x, range(r, r + size), axis) for r in range(count)])

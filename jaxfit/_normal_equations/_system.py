@@ -29,7 +29,7 @@ from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-SCARCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
+LEAST_INFLUENCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
 
 Residual = tuple[Float[Array, "d rows width"], Bending]
 
@@ -114,4 +114,4 @@ def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu n
     there is no smoothing, and would throw anywhere, and surplus ones behind repeated end knots.
     """
     reached = jnp.asarray(stencil.diagonal)
-    return (reached > SCARCE * jnp.max(reached)) & ~jnp.asarray(held)
+    return (reached > LEAST_INFLUENCE * jnp.max(reached)) & ~jnp.asarray(held)

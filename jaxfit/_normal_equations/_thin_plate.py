@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from jaxfit._cells import overlap_add
 from jaxfit._checks import is_concrete
-from jaxfit._normal_equations._stencil import Stencil, windows
+from jaxfit._normal_equations._stencil import Stencil, shifted_slices
 from jaxfit._splines._pieces import Axis, Numbers
 
 TERMS = np.sqrt([1.0, 2.0, 1.0])  # of R_vv, R_uv and R_uu, by the order of the derivative along u
@@ -48,9 +48,9 @@ class ThinPlate(eqx.Module):
         """L P, whose sum of squares is F_s: the three second derivatives at Gauss points, weighted."""
         factor = jnp.asarray(TERMS, net.dtype)[:, None, None, None]
         (_, _, cells_u, order_u), (_, _, cells_v, order_v) = self.roots_u.shape, self.roots_v.shape
-        x = windows(jnp.asarray(net), order_u, cells_u, 0)
+        x = shifted_slices(jnp.asarray(net), order_u, cells_u, 0)
         x = jnp.einsum("dgir,rijc->dgijc", factor * jnp.asarray(self.roots_u), x, precision="highest")
-        x = windows(x, order_v, cells_v, 3)
+        x = shifted_slices(x, order_v, cells_v, 3)
         return jnp.einsum("dhjr,rdgijc->dgihjc", self.roots_v[::-1], x, precision="highest")
 
     def energy(self, net: Float[Array, "nu nv c"]) -> Float[Array, ""]:
@@ -106,5 +106,5 @@ def _bands(roots: Float[Numbers, "3 g cells K"]) -> Any:
     """The matrices as bands, entry (i, i + e) at `[d, e, i]`."""
     xp: Any = np if isinstance(roots, np.ndarray) else jnp
     order = roots.shape[3]
-    neighbours = windows(xp.pad(roots, ((0, 0),) * 3 + ((0, order - 1),)), order, order, 3)
+    neighbours = shifted_slices(xp.pad(roots, ((0, 0),) * 3 + ((0, order - 1),)), order, order, 3)
     return overlap_add(xp.einsum("dgir,edgir->rdei", roots, neighbours), -1)

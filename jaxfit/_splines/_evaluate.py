@@ -12,9 +12,9 @@ from jaxfit._compile import compiled
 from jaxfit._splines._basis import spans_and_weights
 from jaxfit._splines._lookup import windows
 
-# Beyond WHOLE parameters a CPU evaluates block by block: the temporaries then stay in its cache
+# Beyond so many parameters a CPU evaluates block by block: the temporaries then stay in its cache
 # (measured: three times faster at 500,000 points) and memory does not grow with the input.
-WHOLE = 8192
+LARGEST_UNBLOCKED = 8192
 BLOCK = 1024
 
 
@@ -23,7 +23,7 @@ def in_blocks(kernel: Callable[..., Array], *parameters: Array) -> Array:
     shape = parameters[0].shape
     flat = [x.reshape(-1) for x in parameters]
     count = flat[0].size
-    if count <= WHOLE or jax.default_backend() != "cpu":
+    if count <= LARGEST_UNBLOCKED or jax.default_backend() != "cpu":
         result = kernel(*flat)
     else:
         # Padding repeats the last parameter, so that no extrapolated value can overflow.

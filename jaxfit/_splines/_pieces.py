@@ -117,11 +117,11 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     low, high = breaks[:-1], breaks[1:]
     width = high - low
     filled = width > 0
-    centre, half = 0.5 * (low + high), _select(filled, 0.5 * width, 1.0)
+    centre, half = 0.5 * (low + high), _where(filled, 0.5 * width, 1.0)
     number = np.arange(cells, dtype=np.int32)
     # The nearest filled cell from here on, to the left and to the right.
-    left = _highest_so_far(_select(filled, number, -1))
-    right = _lowest_from_here(_select(filled, number, cells))
+    left = _highest_so_far(_where(filled, number, -1))
+    right = _lowest_from_here(_where(filled, number, cells))
     ends = xp.concatenate([right[:1], left[-1:]])
     first, last = (xp.broadcast_to(end, (cells,)) for end in ends)
     before, after, creased = number, number, False
@@ -131,11 +131,11 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
         starts = filled & (knots[order - 1 - reach : order - 1 - reach + cells] >= low)
         stops = filled & (knots[order + reach : order + reach + cells] <= high)
         creased = bool(np.any(starts & (low > breaks[0]))) if concrete else True
-        first = xp.maximum(_highest_so_far(_select(starts, number, 0)), first)
-        last = xp.minimum(_lowest_from_here(_select(stops, number, cells - 1)), last)
+        first = xp.maximum(_highest_so_far(_where(starts, number, 0)), first)
+        last = xp.minimum(_lowest_from_here(_where(stops, number, cells - 1)), last)
         # The filled cell on the other side of a crease; empty spans may lie between.
-        before = _select(first > first[:1], windows(left, xp.maximum(first - 1, 0), 1)[0], number)
-        after = _select(last < last[-1:], windows(right, xp.minimum(last + 1, cells - 1), 1)[0], number)
+        before = _where(first > first[:1], windows(left, xp.maximum(first - 1, 0), 1)[0], number)
+        after = _where(last < last[-1:], windows(right, xp.minimum(last + 1, cells - 1), 1)[0], number)
     bounds = xp.stack([windows(low, first, 1)[0], windows(high, last, 1)[0], centre, half])
     return Axis(
         breaks=breaks.astype(dtype),
@@ -150,7 +150,7 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     )
 
 
-def _select(condition: Any, x: Any, y: float | Any) -> Any:
+def _where(condition: Any, x: Any, y: float | Any) -> Any:
     """`x` where the condition holds, else `y`; either may be a number of the other's type."""
     if is_concrete(condition, x, y):
         return np.where(condition, x, y).astype(x.dtype)
@@ -198,11 +198,11 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
 def _raised_polynomials(basis: Any, left: Any, right: Any) -> Any:
     """The polynomials of one degree more, for all supports, which begin at `left` and end at `right`."""
     share = basis / (right - left)
-    shifted = _moved_on(share, 1)
-    return right * share - shifted + _moved_on(shifted - left * share, 0)
+    shifted = _shifted(share, 1)
+    return right * share - shifted + _shifted(shifted - left * share, 0)
 
 
-def _moved_on(x: Any, axis: int) -> Any:
+def _shifted(x: Any, axis: int) -> Any:
     """The entries of `x` one place on, behind a zero; the last is dropped."""
     if is_concrete(x):
         moved = np.zeros_like(x)

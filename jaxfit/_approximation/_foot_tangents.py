@@ -1,4 +1,4 @@
-"""The tangent directions in which a foot is free to move, and the normal space that is left."""
+"""`FootTangents`: the tangent directions in which a foot is free to move, and projection off them."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from jaxfit._splines._pieces import Pieces
 PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count as none
 
 
-class FreeTangents(NamedTuple):
+class FootTangents(NamedTuple):
     """An orthogonal basis: R_u, and the part of R_v orthogonal to it, each 0 where it is not free.
 
     At a foot on the border a direction is free unless the residual points out of the domain. Of parallel
@@ -29,7 +29,7 @@ class FreeTangents(NamedTuple):
     per_second: Float[Array, "..."]
 
     @staticmethod
-    def at(pieces: Pieces, u: Array, v: Array, e: Array, jet: Jet) -> "FreeTangents":
+    def at(pieces: Pieces, u: Array, v: Array, e: Array, jet: Jet) -> "FootTangents":
         """At feet (u, v) with residuals `e`."""
         s = jnp.where(_held(pieces.axis_u, u, e, jet.s)[None], 0.0, jet.s)
         t = jnp.where(_held(pieces.axis_v, v, e, jet.t)[None], 0.0, jet.t)
@@ -40,7 +40,7 @@ class FreeTangents(NamedTuple):
         square = dot(across, across)
         counts = square > PARALLEL * G
         per_second = jnp.where(counts, 1.0 / jnp.where(counts, square, 1.0), 0.0)
-        return FreeTangents(s, across, share, per_first, per_second)
+        return FootTangents(s, across, share, per_first, per_second)
 
     def entries(self) -> Float[Array, "pairs ..."]:
         """The projection I - Pi on these directions, its entries on and above the diagonal."""
