@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline, NdBSpline
 
-from jaxfit._splines import BSplineCurve, BSplineSurface, basis_derivatives, basis_functions
-from jaxfit._splines._evaluate import BLOCK, WHOLE
+from jaxfit._splines import BSplineCurve, BSplineSurface
+from jaxfit._splines._basis import spans_and_weights
+from jaxfit._splines._evaluate import BLOCK, LARGEST_UNBLOCKED
 
 # Every order from 2 to 8, always mixed.
 ORDERS = [(2, 6), (4, 3), (5, 4), (8, 7)]
@@ -179,7 +180,7 @@ def test_integer_parameters_are_numbers_too():
 
 def test_large_inputs_in_blocks_equal_small_ones():
     surface = helpers.random_surface()
-    u, v = np.random.default_rng(0).random((2, WHOLE + BLOCK // 2))
+    u, v = np.random.default_rng(0).random((2, LARGEST_UNBLOCKED + BLOCK // 2))
     whole = surface(u.reshape(2, -1), v.reshape(2, -1)).reshape(-1, 3)
     for part in (slice(0, 40), slice(-40, None)):
         assert_close(whole[part], surface(u[part], v[part]), 4)
@@ -205,14 +206,13 @@ def test_basis_functions_are_a_partition_of_unity(seed):
     dtype = jnp.result_type(float)
     knots = jnp.asarray(helpers.random_clamped_knots(rng, 10, order, seed % 5), dtype)
     u = jnp.asarray(np.concatenate([rng.random(18), [0.0, 1.0]]), dtype)
-    values = np.asarray(basis_functions(knots, order, u))
-    assert values.shape == (20, order)
+    weights = jax.jit(spans_and_weights, static_argnums=(1, 3, 4))(knots, order, u, (0, 1, 2), False)[1]
+    values, *slopes = np.asarray(weights)
+    assert values.shape == (order, 20)
     assert values.min() >= 0
-    np.testing.assert_allclose(values.sum(axis=1), 1.0, atol=8 * helpers.eps())
-    slopes = np.asarray(basis_derivatives(knots, order, u, 2))
-    assert slopes.shape == (3, 20, order)
-    for table in slopes[1:]:
-        np.testing.assert_allclose(table.sum(axis=1), 0.0, atol=100 * helpers.eps() * np.abs(table).max())
+    np.testing.assert_allclose(values.sum(axis=0), 1.0, atol=8 * helpers.eps())
+    for table in slopes:
+        np.testing.assert_allclose(table.sum(axis=0), 0.0, atol=100 * helpers.eps() * np.abs(table).max())
 
 
 @pytest.mark.float32_too

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfit._base._boundary import Boundary, frame
+from jaxfit._base._boundary import Boundary, centre_and_size
 
 
 class Cloud(NamedTuple):
@@ -14,8 +14,6 @@ class Cloud(NamedTuple):
     points: Float[Any, "distinct d"]
     number: Int[Any, " points"]  # which of these each point handed in is
     sides: list[np.ndarray]  # v0, v1, u0, u1
-    centre: Float[Any, " d"]
-    size: float
 
 
 def cloud_of(points: Float[Any, "points d"], boundary: Boundary) -> Cloud:
@@ -26,13 +24,13 @@ def cloud_of(points: Float[Any, "points d"], boundary: Boundary) -> Cloud:
     """
     sides = [np.asarray(x, float) for x in (boundary.v0, boundary.v1, boundary.u0, boundary.u1)]
     given = np.asarray(points, float)
-    centre, size = frame(sides)
+    centre, size = centre_and_size(sides)
     distinct, number = np.unique((given - centre) / size, axis=0, return_inverse=True)
     order = np.argsort(np.linalg.norm(distinct, axis=1), kind="stable")
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
     lines = [(x - centre) / size for x in sides]
-    return Cloud(distinct[order], place[number.reshape(-1)], lines, centre, size)
+    return Cloud(distinct[order], place[number.reshape(-1)], lines)
 
 
 def thinned(points: Float[Any, "points d"], most: int) -> Float[Any, "kept d"]:

@@ -20,5 +20,4 @@ from jaxfit._cells._rows import make_single_rows as make_single_rows
 from jaxfit._cells._rows import narrow_width as narrow_width
 from jaxfit._cells._rows import row_width as row_width
 from jaxfit._cells._sums import cells_to_net as cells_to_net
-from jaxfit._cells._sums import net_sums as net_sums
 from jaxfit._cells._sums import row_moments as row_moments

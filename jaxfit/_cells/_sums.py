@@ -11,33 +11,13 @@ one cell are added up, and the image is one fixed matrix per span and direction.
 from functools import reduce
 from operator import add, mul
 
-import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._cells._overlap import overlap_add
 from jaxfit._cells._polynomials import powers
-from jaxfit._cells._rows import Rows
 from jaxfit._splines._pieces import Numbers
-
-
-def net_sums(
-    rows: Rows,
-    s: Float[Array, "rows width"],
-    t: Float[Array, "rows width"],
-    values: Float[Array, "c rows width"],
-    poly_u: Float[Numbers, "spans_u K K"],
-    poly_v: Float[Numbers, "spans_v L L"],
-) -> Float[Array, "nu nv c"]:
-    """sum_k N_i(u_k) N_j(v_k) values_k for every control point, empty slots having values 0.
-
-    `poly_u`, `poly_v` are the basis functions as polynomials (`span_polynomials`).
-    """
-    moments = row_moments(s, t, values, poly_u.shape[1], poly_v.shape[1])
-    spans_u, spans_v = poly_u.shape[0], poly_v.shape[0]
-    cells = jax.ops.segment_sum(moments, rows.cell, spans_u * spans_v, indices_are_sorted=True)
-    return cells_to_net(cells, poly_u, poly_v)
 
 
 def row_moments(

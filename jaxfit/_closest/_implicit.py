@@ -13,14 +13,12 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._cells._polynomials import PARTIALS
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import ParameterBounds, project
 from jaxfit._closest._samples import best_samples, sample_points
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import make_pieces
-
-PARTIALS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-
 
 Arrays = tuple[Array, Array, Array]  # control points and both knot vectors
 

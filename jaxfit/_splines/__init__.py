@@ -1,7 +1,5 @@
 """B-spline curves and surfaces: pure mathematics, nothing about fitting."""
 
-from jaxfit._splines._basis import basis_derivatives as basis_derivatives
-from jaxfit._splines._basis import basis_functions as basis_functions
 from jaxfit._splines._basis import find_span as find_span
 from jaxfit._splines._bezier import BezierCurves as BezierCurves
 from jaxfit._splines._bezier import BezierPatches as BezierPatches

@@ -1,14 +1,11 @@
 """B-spline basis functions by the Cox-de Boor recursion, one step for all of them at once."""
 
-from functools import partial
-
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from jaxfit._compile import compiled
 from jaxfit._splines._lookup import last_not_above, windows
 
 
@@ -111,54 +108,6 @@ def spans_and_weights(
         u = clamp(knots, order, u)
     span = find_span(knots, order, u)
     return span - (order - 1), nonzero_basis(local_knots(knots, order, span), u, derivatives)
-
-
-@partial(compiled, static_argnames=("order", "derivatives", "extrapolate"))
-def _stacked(knots: Array, order: int, u: Array, derivatives: tuple[int, ...], extrapolate: bool) -> Array:
-    _, weights = spans_and_weights(knots, order, u, derivatives, extrapolate)
-    return jnp.moveaxis(weights, 1, -1)
-
-
-def basis_functions(
-    knots: Float[Array, " knots"],
-    order: int,
-    u: ArrayLike,
-    derivative: int = 0,
-    *,
-    extrapolate: bool = False,
-) -> Float[Array, "*shape order"]:
-    r"""The basis functions that do not vanish at `u`, or one of their derivatives.
-
-    Entry $r$ belongs to control point $l - K + 1 + r$, $l$ = `find_span(knots, order, u)`,
-    $K$ = `order` (equations (2)-(3) of the paper; NURBS Book, algorithms A2.2 and A2.3).
-
-    Parameters
-    ----------
-    knots : array (count + order,)
-        Non-decreasing, each interior knot at most `order` times. Not checked here.
-    order : int
-        Degree + 1, at least 1.
-    u : array, any shape
-    derivative : int
-        How often to differentiate; from `order` on the result is zero.
-    extrapolate : bool
-        Whether parameters outside the domain continue the end pieces (True) or are first moved
-        to the nearest end (False).
-    """
-    return _stacked(knots, order, as_parameters(u, knots), (derivative,), extrapolate)[0]
-
-
-def basis_derivatives(
-    knots: Float[Array, " knots"],
-    order: int,
-    u: ArrayLike,
-    count: int,
-    *,
-    extrapolate: bool = False,
-) -> Float[Array, "derivatives *shape order"]:
-    """The non-vanishing basis functions and their first `count` derivatives, shape
-    (count + 1, ..., order); otherwise as `basis_functions`."""
-    return _stacked(knots, order, as_parameters(u, knots), tuple(range(count + 1)), extrapolate)
 
 
 def as_parameters(u: ArrayLike, like: Array) -> Array:
