@@ -17,6 +17,7 @@ from jaxfit._approximation._damping import (
 )
 from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
+from jaxfit._approximation._net_roughness import _corner_mean as corner_mean
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._second_order import second_order_rhs
@@ -41,6 +42,13 @@ class OrthogonalState(eqx.Module):
     smoothing: Float[Any, ""]
     damping: DampingState
     plate: ThinPlate | None
+    total: Any
+    kappa: Any
+    shape: Any  # of the surface: thin plate, tangential, squares of second differences, folds on net, count
+    local: Any
+    settled: Any
+    rough: Any
+    gamma: Any
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -127,7 +135,21 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ValueError: damping must be greater than 0 and at most 1, but is 2.0; the default is 0.01.
     """
 
-    smoothing: Any = 5e-6
+    smoothing: Any = 0.0
+    evenness: float = 1.0
+    first_smoothing: float = 1.0
+    fall: float = 0.7
+    raise_: float = 2.0
+    least_kappa: float = 1e-3
+    most_kappa: float = 1e2
+    forget: float = 0.9
+    shorter: float = 0.2
+    settle: float = 0.1
+    gup: float = 1.2
+    gback: float = 2.0
+    gmax: float = 1000.0
+    gfloor: float = 4.0
+    gfirst: float = 100.0
     border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
@@ -170,16 +192,41 @@ class OrthogonalDistance(AbstractIterativeMethod):
         plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
         smoothing = as_smoothing(self.smoothing, dtype)
-        return surface, OrthogonalState(smoothing, first_damping(surface, dtype), plate)
+        total = jnp.sum(jnp.asarray(problem.weight))
+        net = jnp.zeros(surface.control_points.shape[:2], dtype)
+        z = jnp.zeros((), dtype)
+        return surface, OrthogonalState(
+            jnp.asarray(smoothing * self.first_smoothing, dtype) * total, first_damping(surface, dtype), plate, total / net.size, z, (z, net, net.T, net, z, net[1:, 1:], z), net + self.gfirst, net, z, z + 0.5 * net.size
+        )
+
+    def _differences(self, surface):
+        from jaxfit._approximation._net_roughness import Differences
+        k, l = surface.order
+        def g(knots, order, n):
+            return sum(knots[i : i + n] for i in range(1, order)) / (order - 1)
+        nu, nv = surface.control_points.shape[:2]
+        return Differences.of(g(surface.knots_u, k, nu), g(surface.knots_v, l, nv))
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
         """Converged feet, starting from the last accepted ones, and the thin-plate energy."""
+        from jaxfit._approximation._folds import folded_cells, spread_to_net
         surface, state = iterate.surface, iterate.state
+        pieces = surface.pieces
         here = measure_feet(
-            self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
+            self.foot_method, problem, pieces, iterate.projection, self.foot_tolerance
         )
-        energy = state.smoothing * plate_of(state.plate, surface).energy(surface.control_points)
-        return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
+        net = surface.control_points
+        plate = plate_of(state.plate, surface).energy(net)
+        eu, ev, em = self._differences(surface).energies(net)
+        wu, wv, wm = self._differences(surface).relative(net)
+        R = jnp.sum(wu * eu) + jnp.sum(wv * ev) + jnp.sum(wm * em)
+        folds = folded_cells(pieces)
+        shape = (plate, eu, ev, spread_to_net(folds, surface.order), jnp.sum(folds), em, R)
+        return here, eqx.tree_at(lambda s: s.shape, state, shape)
+
+    def _penalty(self, state, smoothing, weights, shape):
+        wu, wv, wm = weights
+        return smoothing * shape[0] + state.kappa * (jnp.sum(wu * shape[1]) + jnp.sum(wv * shape[2]) + jnp.sum(wm * shape[5]))
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new iterate if its objective is lower, otherwise the old surface."""
@@ -188,30 +235,48 @@ class OrthogonalDistance(AbstractIterativeMethod):
         weight = problem.weight
         # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        objective = total_cost(self.loss, length, weight, before.error) + old.state.damping.energy
-        gain = objective - total_cost(self.loss, length, weight, here.error) - state.energy
+        s = new.state
+        wu, wv, wm = self._differences(state.origin).relative(state.origin.control_points)
+        weights = (s.local * wu, s.local.T * wv, corner_mean(s.local) * wm)
+        objective = total_cost(self.loss, length, weight, before.error) + self._penalty(s, s.smoothing, weights, old.state.shape)
+        gain = objective - total_cost(self.loss, length, weight, here.error) - self._penalty(s, s.smoothing, weights, s.shape)
         feet = (before.u, before.v), (here.u, here.v)
         longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
         # With a traced lambda that is none no step is finite, and the loop ends.
         lost = jnp.isnan(new.state.smoothing)
-        good = lost | ((gain > 0) & is_plausible(state, gain, longest_move))
-        damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, good))
+        better = lost | ((gain > 0) & is_plausible(state, gain, longest_move))
+        folds, were = s.shape[4], old.state.shape[4]
+        good = better & (folds <= were)
+        damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, better))
+        damping = jnp.where(better & ~good, state.damping, damping)
+        g = s.local
+        bad = lax.reduce_window((s.shape[3] > 0).astype(g.dtype), 0.0, lax.max, (3, 3), (1, 1), "SAME") > 0
+        bad = bad & better
+        refused = bad & ~good
+        gmin = jnp.where(refused, jnp.maximum(s.settled, jnp.minimum(1.2 * g, self.gmax)), s.settled)
+        grown = jnp.minimum(jnp.where(good, self.gup, self.gback) * g, self.gmax)
+        fallen = jnp.where(good, jnp.maximum(self.fall * g, gmin), g)
+        local = jnp.where(bad, jnp.maximum(grown, g), fallen)
+        settled, total = gmin, s.total
+        smoothing = jnp.where(good, jnp.maximum(s.smoothing * self.fall, self.smoothing * jnp.sum(weight)), s.smoothing)
         origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
         kept = lax.cond(
             good,
-            lambda: (new.surface, here, state.energy),
-            lambda: (origin.surface, before, old.state.damping.energy),
+            lambda: (new.surface, here, s.shape),
+            lambda: (origin.surface, before, old.state.shape),
         )
-        surface, projection, energy = kept
+        surface, projection, shape = kept
         projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
         rejected = state.rejected_steps + ~good
-        damped = DampingState(surface, energy, state.predicted, damping, rejected)
+        damped = DampingState(surface, state.energy, state.predicted, damping, rejected)
         return Iterate(
-            surface, projection, OrthogonalState(new.state.smoothing, damped, new.state.plate), new.step
+            surface, projection, OrthogonalState(smoothing, damped, new.state.plate, s.total, s.kappa, shape, local, settled, s.rough, s.gamma), new.step
         )
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """New knots if it is time, and a step that `accept` decides on once it has been measured."""
+        from jaxfit._approximation._net_roughness import stencil_of
+        from jaxfit._approximation._folds import folded_cells, spread_to_net
         here, damping = iterate.projection, iterate.state.damping
         surface = self._refined(problem, iterate)
         net, axes = surface.control_points, surface.axes
@@ -230,6 +295,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
             return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
+        s = iterate.state
+        count = jnp.sum(problem.counted)
+        gamma = jnp.minimum(s.gamma, 0.9 * count)
+        rss = total_cost(self.loss, length, problem.weight, here.error)
+        g = jnp.maximum(s.local, jnp.minimum(self.gmax, self.evenness * gamma / s.shape[6]))
+        g = jnp.maximum(g, self.gfloor)
+        kappa = rss / (count - gamma)
+        s = eqx.tree_at(lambda s: s.local, s, g)
+        s = eqx.tree_at(lambda s: s.kappa, s, kappa)
+        d = self._differences(surface)
+        wu, wv, wm = d.relative(net)
+        roughness = stencil_of(d, s.kappa * s.local * wu, s.kappa * s.local.T * wv, s.kappa * corner_mean(s.local) * wm, surface.order)
         solve = partial(
             gauss_newton_step,
             plate_of(iterate.state.plate, surface),
@@ -237,11 +314,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
             self.reach,
             correction_rhs,
         )
-        following, predicted = materialise(always, solve, equations, net, held, damping.damping)
+        following, predicted, gamma = materialise(always, solve, equations, net, held, damping.damping, roughness)
         lost = jnp.isnan(iterate.state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
         damped = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
-        state = OrthogonalState(iterate.state.smoothing, damped, iterate.state.plate)
+        state = eqx.tree_at(lambda s: (s.damping, s.gamma), s, (damped, gamma))
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
     def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
@@ -261,6 +338,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         energy = plate_of(state.plate, surface).energy(surface.control_points)
         return iterate, {
             "smoothing": state.smoothing,
+            "folds": state.shape[4],
+            "kappa": state.local, "gmin": state.settled, "gamma": state.gamma, "rough": state.shape[6], "rho": state.kappa,
             "bending_energy": energy * problem.scale**2,
             "damping": state.damping.damping,
             "rejected_steps": state.damping.rejected_steps,
