@@ -1,4 +1,4 @@
-"""Folds of a surface during a fit: neighbouring samples whose normals face away from one another."""
+"""Where a surface folds during a fit: neighbouring samples whose normals turn away from one another."""
 
 from typing import Any
 
@@ -9,50 +9,53 @@ from jaxtyping import Bool, Float
 
 from jaxfit._splines._pieces import Pieces
 
-SAMPLES = 5  # a cell and direction
-COSINE = 0.2
+# So many samples in each cell and direction, both ends included. Between neighbours normals may turn by 60
+# degrees, which is 90 degrees within a fifth of a cell.
+SAMPLES, COSINE = 8, 0.5
 
 
-def folded_cells(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
-    """How many pairs of neighbouring samples are folds, in each cell."""
-    order_u, order_v = pieces.order
-    cells = pieces.axis_u.cells, pieces.axis_v.cells
-    s = (2.0 * np.arange(SAMPLES) + 1.0) / SAMPLES - 1.0
-    value, slope = ([_monomials(s, n, d) for n in (order_u, order_v)] for d in (0, 1))
-    c = jnp.asarray(pieces.coefficients)
-    dtype = c.dtype
-    tangents = []
-    for x, y in ((slope[0], value[1]), (value[0], slope[1])):
-        at = jnp.einsum("cdab,ma,nb->dcmn", c, jnp.asarray(x, dtype), jnp.asarray(y, dtype))
-        at = at.reshape(-1, *cells, SAMPLES, SAMPLES).transpose(0, 1, 3, 2, 4)
-        tangents.append(at.reshape(-1, cells[0] * SAMPLES, cells[1] * SAMPLES))
-    su, sv = tangents
+def folds_by_cell(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
+    """The number of folds that begin in each cell. Places without a normal count as none."""
+    along = [_tangents(pieces, derivative) for derivative in (0, 1)]
+    size = jnp.sqrt(jnp.maximum(_facing(along, along), 0.0))
 
-    def facing(here: Any, there: Any) -> Array:
-        """The product of the normals, by Lagrange's identity."""
-        (a, b), (x, y) = here, there
-        return _dot(a, x) * _dot(b, y) - _dot(a, y) * _dot(b, x)
+    def folded(axis: int) -> Float[Array, "a b"]:
+        def but(first: bool, x: Array) -> Array:
+            n = x.shape[axis - 2]
+            return lax.slice_in_dim(x, *((1, n) if first else (0, n - 1)), axis=x.ndim + axis - 2)
 
-    area = facing((su, sv), (su, sv))
-    size = jnp.sqrt(jnp.maximum(area, 0.0))
-    along_u = facing((su[:, 1:], sv[:, 1:]), (su[:, :-1], sv[:, :-1])) < COSINE * size[1:] * size[:-1]
-    along_v = facing((su[:, :, 1:], sv[:, :, 1:]), (su[:, :, :-1], sv[:, :, :-1])) < COSINE * size[:, 1:] * size[:, :-1]
-    folds = jnp.pad(along_u, ((0, 1), (0, 0))).astype(dtype) + jnp.pad(along_v, ((0, 0), (0, 1))).astype(dtype)
-    return jnp.sum(folds.reshape(cells[0], SAMPLES, cells[1], SAMPLES), axis=(1, 3))
+        here, there = ([but(first, x) for x in along] for first in (False, True))
+        turned = _facing(here, there) < COSINE * but(False, size) * but(True, size)
+        return jnp.pad(turned, [(0, int(k == axis)) for k in range(2)]).astype(size.dtype)
+
+    number = folded(0) + folded(1)
+    cells_u, cells_v = pieces.axis_u.cells, pieces.axis_v.cells
+    return jnp.sum(number.reshape(cells_u, SAMPLES, cells_v, SAMPLES), axis=(1, 3))
 
 
-def _monomials(s: Any, order: int, derivative: int) -> Any:
-    a = np.arange(order)
-    if derivative:
-        return np.where(a > 0, a * s[:, None] ** np.maximum(a - 1, 0), 0.0)
-    return s[:, None] ** a
+def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d a b"]:
+    """Tangents on all samples, in local coordinates: their length does not matter."""
+    s = np.linspace(-1.0, 1.0, SAMPLES)
+    tables: list[Any] = []
+    for axis, order in enumerate(pieces.order):
+        power = np.arange(order)
+        table = s[:, None] ** power
+        if axis == direction:
+            table = power * s[:, None] ** np.maximum(power - 1, 0)
+        tables.append(jnp.asarray(table, pieces.coefficients.dtype))
+    at = jnp.einsum("cdab,ma,nb->dcmn", pieces.coefficients, *tables)
+    cells_u, cells_v = pieces.axis_u.cells, pieces.axis_v.cells
+    at = at.reshape(-1, cells_u, cells_v, SAMPLES, SAMPLES).transpose(0, 1, 3, 2, 4)
+    return at.reshape(-1, cells_u * SAMPLES, cells_v * SAMPLES)
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.sum(a * b, axis=0)
+def _facing(here: list[Array], there: list[Array]) -> Float[Array, "a b"]:
+    """The product of two normals, by Lagrange's identity, which holds in every dimension."""
+    (a, b), (x, y) = here, there
+    return jnp.sum(a * x, 0) * jnp.sum(b * y, 0) - jnp.sum(a * y, 0) * jnp.sum(b * x, 0)
 
 
-def spread_to_net(cells: Float[Array, "cells_u cells_v"], order: tuple[int, int]) -> Float[Array, "nu nv"]:
-    """The largest of the cells that a control point influences."""
-    k, m = order
-    return lax.reduce_window(cells, 0.0, lax.max, (k, m), (1, 1), ((k - 1, k - 1), (m - 1, m - 1)))
+def near_folds(folds: Float[Array, "cells_u cells_v"], order: tuple[int, int]) -> Bool[Array, "nu nv"]:
+    """The control points that influence a cell with folds, and their neighbours."""
+    window, sides = tuple(k + 2 for k in order), [(k, k) for k in order]
+    return lax.reduce_window(folds, jnp.zeros((), folds.dtype), lax.max, window, (1, 1), sides) > 0

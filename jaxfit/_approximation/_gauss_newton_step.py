@@ -4,14 +4,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._damping import within_reach
 from jaxfit._approximation._distance_rows import NormalEquations
-from jaxfit._normal_equations._block_cholesky import substitute
-from jaxfit._normal_equations import Stencil, ThinPlate, coupled_preconditioner, free_points, solve_coupled
+from jaxfit._approximation._smoothing_term import Penalty
+from jaxfit._normal_equations import Stencil, coupled_preconditioner, free_points, solve_coupled
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients
@@ -19,36 +18,29 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
 def gauss_newton_step(
-    plate: ThinPlate,
-    smoothing: Any,
+    penalty: Penalty,
     reach: Any,
     correction_rhs: Callable[[Array, Array], Array],
     equations: NormalEquations,
     net: Float[Array, "nu nv d"],
     held: Bool[Array, "nu nv"],
     damping: Float[Array, ""],
-    roughness: Any,
 ) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
     """The net after the step, and the predicted reduction of the objective.
 
     `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
     damping 1 there is none.
     """
-    stiffness = plate.stencil()
-    matrix = equations.matrix.plus(stiffness, smoothing)
-    matrix = matrix.plus(roughness, 1.0)
+    stiffness = penalty.stencil()
+    matrix = equations.matrix.plus(stiffness, 1.0)
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     scale = 1.0 + (net.shape[2] - 1) * damping
-    uncoupled = Stencil(equations.matrix.trace.entries / scale).plus(stiffness, smoothing).plus(roughness, 1.0)
+    uncoupled = Stencil(equations.matrix.trace.entries / scale).plus(stiffness, 1.0)
     free = free_points(uncoupled, held)
-    right = equations.gradient - smoothing * plate.adjoint(plate.residual(net)) - roughness(net)
+    right = equations.gradient - penalty.gradient(net)
     right = jnp.where(free[:, :, None], right, 0.0)
     preconditioner = coupled_preconditioner(matrix, uncoupled, free)
     corrected = damping < 1
-    signs = np.random.default_rng(0).integers(0, 2, net.shape) * 2.0 - 1.0
-    probes = jnp.where(free[:, :, None], jnp.asarray(signs, net.dtype), 0.0)
-    data = Stencil(equations.matrix.trace.entries / scale)
-    gamma = jnp.sum(data(probes) * substitute(preconditioner.factors, probes)) / net.shape[2]
 
     def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""
@@ -64,7 +56,7 @@ def gauss_newton_step(
     move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
     whole = within_reach(net, move + _at_most(LARGEST_CORRECTION, correction, move), reach)
-    return net + jnp.where(corrected, whole, move), predicted, gamma
+    return net + jnp.where(corrected, whole, move), predicted
 
 
 def _at_most(share: float, correction: Array, move: Array) -> Array:

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
@@ -17,11 +18,17 @@ from jaxfit._approximation._damping import (
 )
 from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
-from jaxfit._approximation._net_roughness import _corner_mean as corner_mean
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
+from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
-from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
+from jaxfit._approximation._smoothing_term import (
+    WeightedPlate,
+    as_smoothing,
+    check_smoothing,
+    constant_plate,
+    plate_of,
+)
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -37,18 +44,17 @@ from jaxfit._splines._pieces import pieces_on
 
 
 class OrthogonalState(eqx.Module):
-    """lambda, the damping of the steps, and the thin plate of a fit that keeps its knots."""
+    """The damping of the steps and the smoothing term of the last one.
 
-    smoothing: Float[Any, ""]
+    With RegularSmoothing() there is a `guard`, without it lambda, `smoothing`, against the sum of the weights,
+    and the thin plate of a fit that keeps its knots.
+    """
+
     damping: DampingState
+    penalty: Any
+    guard: FoldGuard | None
+    smoothing: Float[Any, ""]
     plate: ThinPlate | None
-    total: Any
-    kappa: Any
-    shape: Any  # of the surface: thin plate, tangential, squares of second differences, folds on net, count
-    local: Any
-    settled: Any
-    rough: Any
-    gamma: Any
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -135,21 +141,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ValueError: damping must be greater than 0 and at most 1, but is 2.0; the default is 0.01.
     """
 
-    smoothing: Any = 0.0
-    evenness: float = 1.0
-    first_smoothing: float = 1.0
-    fall: float = 0.7
-    raise_: float = 2.0
-    least_kappa: float = 1e-3
-    most_kappa: float = 1e2
-    forget: float = 0.9
-    shorter: float = 0.2
-    settle: float = 0.1
-    gup: float = 1.2
-    gback: float = 2.0
-    gmax: float = 1000.0
-    gfloor: float = 4.0
-    gfirst: float = 100.0
+    smoothing: Any = RegularSmoothing()
     border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
@@ -161,7 +153,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     stall_gain: float = 2e-3
 
     def __check_init__(self) -> None:
-        check_smoothing(self.smoothing)
+        if not isinstance(self.smoothing, RegularSmoothing):
+            check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
@@ -189,146 +182,114 @@ class OrthogonalDistance(AbstractIterativeMethod):
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, OrthogonalState]:
         """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
-        plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
+        dtype = problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
-        smoothing = as_smoothing(self.smoothing, dtype)
-        total = jnp.sum(jnp.asarray(problem.weight))
-        net = jnp.zeros(surface.control_points.shape[:2], dtype)
-        z = jnp.zeros((), dtype)
-        return surface, OrthogonalState(
-            jnp.asarray(smoothing * self.first_smoothing, dtype) * total, first_damping(surface, dtype), plate, total / net.size, z, (z, net, net.T, net, z, net[1:, 1:], z), net + self.gfirst, net, z, z + 0.5 * net.size
+        damping, total = first_damping(surface, dtype), problem.weight.sum()
+        if isinstance(self.smoothing, RegularSmoothing):
+            cells = surface.axis_u.cells, surface.axis_v.cells
+            guard = self.smoothing.begin(surface.control_points.shape[:2], cells, dtype)
+            nothing = np.zeros((), dtype)
+            penalty = self.smoothing.penalty(guard, surface, nothing)
+            return surface, OrthogonalState(damping, penalty, guard, nothing, None)
+        plate, smoothing = (
+            constant_plate(self.insertion, surface),
+            as_smoothing(self.smoothing, dtype) * total,
         )
-
-    def _differences(self, surface):
-        from jaxfit._approximation._net_roughness import Differences
-        k, l = surface.order
-        def g(knots, order, n):
-            return sum(knots[i : i + n] for i in range(1, order)) / (order - 1)
-        nu, nv = surface.control_points.shape[:2]
-        return Differences.of(g(surface.knots_u, k, nu), g(surface.knots_v, l, nv))
+        penalty = WeightedPlate(plate_of(plate, surface), smoothing)
+        return surface, OrthogonalState(damping, penalty, None, smoothing, plate)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
-        """Converged feet, starting from the last accepted ones, and the thin-plate energy."""
-        from jaxfit._approximation._folds import folded_cells, spread_to_net
+        """Converged feet, starting from the last accepted ones, and the folds."""
         surface, state = iterate.surface, iterate.state
-        pieces = surface.pieces
         here = measure_feet(
-            self.foot_method, problem, pieces, iterate.projection, self.foot_tolerance
+            self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
         )
-        net = surface.control_points
-        plate = plate_of(state.plate, surface).energy(net)
-        eu, ev, em = self._differences(surface).energies(net)
-        wu, wv, wm = self._differences(surface).relative(net)
-        R = jnp.sum(wu * eu) + jnp.sum(wv * ev) + jnp.sum(wm * em)
-        folds = folded_cells(pieces)
-        shape = (plate, eu, ev, spread_to_net(folds, surface.order), jnp.sum(folds), em, R)
-        return here, eqx.tree_at(lambda s: s.shape, state, shape)
-
-    def _penalty(self, state, smoothing, weights, shape):
-        wu, wv, wm = weights
-        return smoothing * shape[0] + state.kappa * (jnp.sum(wu * shape[1]) + jnp.sum(wv * shape[2]) + jnp.sum(wm * shape[5]))
+        if state.guard is None:
+            return here, state
+        return here, eqx.tree_at(lambda s: s.guard, state, state.guard.seeing(surface))
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new iterate if its objective is lower, otherwise the old surface."""
-        state: DampingState = new.state.damping
+        """The new iterate if its objective is lower and it has no more folds, otherwise the old surface."""
+        state, damped = new.state, new.state.damping
         here, before = new.projection, old.projection
-        weight = problem.weight
         # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        s = new.state
-        wu, wv, wm = self._differences(state.origin).relative(state.origin.control_points)
-        weights = (s.local * wu, s.local.T * wv, corner_mean(s.local) * wm)
-        objective = total_cost(self.loss, length, weight, before.error) + self._penalty(s, s.smoothing, weights, old.state.shape)
-        gain = objective - total_cost(self.loss, length, weight, here.error) - self._penalty(s, s.smoothing, weights, s.shape)
+        objective, after = (
+            total_cost(self.loss, length, problem.weight, error) + state.penalty.energy(net)
+            for error, net in (
+                (before.error, damped.origin.control_points),
+                (here.error, new.surface.control_points),
+            )
+        )
+        gain = objective - after
         feet = (before.u, before.v), (here.u, here.v)
         longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
         # With a traced lambda that is none no step is finite, and the loop ends.
-        lost = jnp.isnan(new.state.smoothing)
-        better = lost | ((gain > 0) & is_plausible(state, gain, longest_move))
-        folds, were = s.shape[4], old.state.shape[4]
-        good = better & (folds <= were)
-        damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, better))
-        damping = jnp.where(better & ~good, state.damping, damping)
-        g = s.local
-        bad = lax.reduce_window((s.shape[3] > 0).astype(g.dtype), 0.0, lax.max, (3, 3), (1, 1), "SAME") > 0
-        bad = bad & better
-        refused = bad & ~good
-        gmin = jnp.where(refused, jnp.maximum(s.settled, jnp.minimum(1.2 * g, self.gmax)), s.settled)
-        grown = jnp.minimum(jnp.where(good, self.gup, self.gback) * g, self.gmax)
-        fallen = jnp.where(good, jnp.maximum(self.fall * g, gmin), g)
-        local = jnp.where(bad, jnp.maximum(grown, g), fallen)
-        settled, total = gmin, s.total
-        smoothing = jnp.where(good, jnp.maximum(s.smoothing * self.fall, self.smoothing * jnp.sum(weight)), s.smoothing)
-        origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
-        kept = lax.cond(
-            good,
-            lambda: (new.surface, here, s.shape),
-            lambda: (origin.surface, before, old.state.shape),
-        )
-        surface, projection, shape = kept
+        lost = jnp.isnan(state.smoothing)
+        good = better = lost | ((gain > 0) & is_plausible(damped, gain, longest_move))
+        guard = state.guard
+        if guard is not None:
+            good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
+            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order)
+        # A step that folds is taken again with more smoothing there, not with more damping everywhere.
+        following = jnp.where(better & ~good, damped.damping, next_damping(damped, objective, gain, better))
+        following = jnp.where(new.step == 1, self.damping, following)
+        kept = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
+        surface, projection = kept
         projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
-        rejected = state.rejected_steps + ~good
-        damped = DampingState(surface, state.energy, state.predicted, damping, rejected)
-        return Iterate(
-            surface, projection, OrthogonalState(smoothing, damped, new.state.plate, s.total, s.kappa, shape, local, settled, s.rough, s.gamma), new.step
-        )
+        damped = DampingState(surface, damped.predicted, following, damped.rejected_steps + ~good)
+        state = OrthogonalState(damped, state.penalty, guard, state.smoothing, state.plate)
+        return Iterate(surface, projection, state, new.step)
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """New knots if it is time, and a step that `accept` decides on once it has been measured."""
-        from jaxfit._approximation._net_roughness import stencil_of
-        from jaxfit._approximation._folds import folded_cells, spread_to_net
-        here, damping = iterate.projection, iterate.state.damping
-        surface = self._refined(problem, iterate)
+        here, state = iterate.projection, iterate.state
+        surface, guard = self._refined(problem, iterate)
+        damping = state.damping.damping
         net, axes = surface.control_points, surface.axes
         length = loss_length(self.loss, problem, here.error)
         weight = reweighted(self.loss, length, problem.weight, here.error)
         held = held_points(self.border, net.shape, surface.used)
+        if guard is not None:
+            held = held | (guard.held > 0)
         always = problem.diagonal > 0
         feet = (here.u, here.v, weight)
         equations = materialise(
             always,
             lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
-            *(net, *feet, damping.damping),
+            *(net, *feet, damping),
         )
+        if guard is None:
+            penalty: Any = WeightedPlate(plate_of(state.plate, surface), state.smoothing)
+        else:
+            size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
+            penalty = self.smoothing.penalty(guard, surface, size)
 
         def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
             return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
-        s = iterate.state
-        count = jnp.sum(problem.counted)
-        gamma = jnp.minimum(s.gamma, 0.9 * count)
-        rss = total_cost(self.loss, length, problem.weight, here.error)
-        g = jnp.maximum(s.local, jnp.minimum(self.gmax, self.evenness * gamma / s.shape[6]))
-        g = jnp.maximum(g, self.gfloor)
-        kappa = rss / (count - gamma)
-        s = eqx.tree_at(lambda s: s.local, s, g)
-        s = eqx.tree_at(lambda s: s.kappa, s, kappa)
-        d = self._differences(surface)
-        wu, wv, wm = d.relative(net)
-        roughness = stencil_of(d, s.kappa * s.local * wu, s.kappa * s.local.T * wv, s.kappa * corner_mean(s.local) * wm, surface.order)
-        solve = partial(
-            gauss_newton_step,
-            plate_of(iterate.state.plate, surface),
-            iterate.state.smoothing,
-            self.reach,
-            correction_rhs,
-        )
-        following, predicted, gamma = materialise(always, solve, equations, net, held, damping.damping, roughness)
-        lost = jnp.isnan(iterate.state.smoothing)  # a traced lambda that is none
+        def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
+            return gauss_newton_step(penalty, self.reach, correction_rhs, *x)
+
+        following, predicted = materialise(always, solve, penalty, equations, net, held, damping)
+        lost = jnp.isnan(state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
-        damped = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
-        state = eqx.tree_at(lambda s: (s.damping, s.gamma), s, (damped, gamma))
+        damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)
+        state = OrthogonalState(damped, penalty, guard, state.smoothing, state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
-    def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
+    def _refined(self, problem: Problem, iterate: Iterate) -> tuple[WorkingSurface, FoldGuard | None]:
         """The accepted surface, with new knots if it is time; they change neither it nor its feet."""
+        surface, guard = iterate.surface, iterate.state.guard
         if self.insertion is None:
-            return iterate.surface
+            return surface, guard
         refine = partial(self.insertion, projection=iterate.projection, counted=problem.counted)
-        return lax.cond(
-            iterate.step > 0, lambda: refine(iterate.step, iterate.surface), lambda: iterate.surface
-        )
+        refined = lax.cond(iterate.step > 0, lambda: refine(iterate.step, surface), lambda: surface)
+        if guard is not None:
+            grown = jnp.any(jnp.asarray(refined.used) > jnp.asarray(surface.used))
+            guard = lax.cond(grown, lambda: self.smoothing.renewed(guard, refined), lambda: guard)
+        return refined, guard
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
@@ -336,11 +297,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
         """The iterate as it is; lambda, the integral (10), the last damping and the rejected steps."""
         state, surface = iterate.state, iterate.surface
         energy = plate_of(state.plate, surface).energy(surface.control_points)
-        return iterate, {
-            "smoothing": state.smoothing,
-            "folds": state.shape[4],
-            "kappa": state.local, "gmin": state.settled, "gamma": state.gamma, "rough": state.shape[6], "rho": state.kappa,
+        stats = {**({} if state.guard is None else {"guard": state.guard}), 
             "bending_energy": energy * problem.scale**2,
             "damping": state.damping.damping,
             "rejected_steps": state.damping.rejected_steps,
         }
+        if state.guard is None:
+            return iterate, {"smoothing": state.smoothing / jnp.sum(problem.weight), **stats}
+        return iterate, stats
