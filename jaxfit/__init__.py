@@ -20,6 +20,7 @@ from jaxfit._approximation import LevenbergMarquardt as LevenbergMarquardt
 from jaxfit._approximation import LocalFeet as LocalFeet
 from jaxfit._approximation import Nesterov as Nesterov
 from jaxfit._approximation import OrthogonalDistance as OrthogonalDistance
+from jaxfit._approximation import RegularSmoothing as RegularSmoothing
 from jaxfit._approximation import StandardApproximation as StandardApproximation
 from jaxfit._approximation import Tukey as Tukey
 from jaxfit._approximation import approximate as approximate

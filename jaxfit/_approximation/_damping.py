@@ -24,12 +24,10 @@ LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 class DampingState(eqx.Module):
     """The surface a step began from, and what decides whether it is accepted.
 
-    `energy` is the thin plate's part of the objective, `predicted` the predicted reduction of the objective.
-    `damping` lies between its minimum and 1, at which no step can fail.
+    `predicted` is the predicted reduction of the objective. `damping` lies between its minimum and 1, at which no step can fail.
     """
 
     origin: WorkingSurface
-    energy: Float[Any, ""]
     predicted: Float[Any, ""]
     damping: Float[Any, ""]
     rejected_steps: Int[Any, ""]
@@ -38,7 +36,7 @@ class DampingState(eqx.Module):
 def first_damping(surface: WorkingSurface, dtype: Any) -> DampingState:
     """The state before the first step, whose damping is 1."""
     zero, one = np.zeros((), dtype), np.ones((), dtype)
-    return DampingState(surface, zero, zero, one, np.zeros((), np.int32))
+    return DampingState(surface, zero, one, np.zeros((), np.int32))
 
 
 def is_plausible(state: DampingState, gain: Array, longest_move: Array) -> Array:

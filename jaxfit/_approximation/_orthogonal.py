@@ -4,7 +4,9 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
@@ -19,8 +21,15 @@ from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
+from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
-from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
+from jaxfit._approximation._smoothing_term import (
+    WeightedPlate,
+    as_smoothing,
+    check_smoothing,
+    constant_plate,
+    plate_of,
+)
 from jaxfit._barrier import materialise
 from jaxfit._checks import check_kind, check_number
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -36,10 +45,16 @@ from jaxfit._splines._pieces import pieces_on
 
 
 class OrthogonalState(eqx.Module):
-    """lambda, the damping of the steps, and the thin plate of a fit that keeps its knots."""
+    """The damping of the steps and the smoothing term of the last one.
 
-    smoothing: Float[Any, ""]
+    With RegularSmoothing() there is a `guard`, without it lambda, `smoothing`, against the sum of the weights,
+    and the thin plate of a fit that keeps its knots.
+    """
+
     damping: DampingState
+    penalty: Any
+    guard: FoldGuard | None
+    smoothing: Float[Any, ""]
     plate: ThinPlate | None
 
 
@@ -127,7 +142,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ValueError: damping must be greater than 0 and at most 1, but is 2.0; the default is 0.01.
     """
 
-    smoothing: Any = 5e-6
+    smoothing: Any = RegularSmoothing()
     border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
@@ -139,7 +154,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     stall_gain: float = 2e-3
 
     def __check_init__(self) -> None:
-        check_smoothing(self.smoothing)
+        if not isinstance(self.smoothing, RegularSmoothing):
+            check_smoothing(self.smoothing)
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
@@ -169,89 +185,107 @@ class OrthogonalDistance(AbstractIterativeMethod):
         """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
         plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
-        smoothing = as_smoothing(self.smoothing, dtype)
-        return surface, OrthogonalState(smoothing, first_damping(surface, dtype), plate)
+        damping, total = first_damping(surface, dtype), problem.weight.sum()
+        if isinstance(self.smoothing, RegularSmoothing):
+            cells = surface.axis_u.cells, surface.axis_v.cells
+            guard = self.smoothing.begin(surface.control_points.shape[:2], cells, dtype)
+            nothing = np.zeros((), dtype)
+            shapes = jax.eval_shape(self.smoothing.penalty, guard, surface, nothing)
+            penalty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)  # of no step yet
+            return surface, OrthogonalState(damping, penalty, guard, nothing, plate)
+        smoothing = as_smoothing(self.smoothing, dtype) * total
+        penalty = WeightedPlate(plate_of(plate, surface), smoothing)
+        return surface, OrthogonalState(damping, penalty, None, smoothing, plate)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
-        """Converged feet, starting from the last accepted ones, and the thin-plate energy."""
+        """Converged feet, starting from the last accepted ones, and the folds."""
         surface, state = iterate.surface, iterate.state
         here = measure_feet(
             self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
         )
-        energy = state.smoothing * plate_of(state.plate, surface).energy(surface.control_points)
-        return here, eqx.tree_at(lambda s: s.damping.energy, state, energy)
+        if state.guard is None:
+            return here, state
+        return here, eqx.tree_at(lambda s: s.guard, state, state.guard.seeing(surface))
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
-        """The new iterate if its objective is lower, otherwise the old surface."""
-        state: DampingState = new.state.damping
+        """The new iterate if its objective is lower and it has no more folds, otherwise the old surface."""
+        state, damped = new.state, new.state.damping
         here, before = new.projection, old.projection
-        weight = problem.weight
         # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        objective = total_cost(self.loss, length, weight, before.error) + old.state.damping.energy
-        gain = objective - total_cost(self.loss, length, weight, here.error) - state.energy
+        errors = jnp.stack([before.error, here.error])
+        nets = jnp.stack([damped.origin.control_points, new.surface.control_points])
+        costs = jax.vmap(partial(total_cost, self.loss, length, problem.weight))(errors)
+        objective, after = costs + jax.vmap(state.penalty.energy)(nets)
+        gain = objective - after
         feet = (before.u, before.v), (here.u, here.v)
         longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
         # With a traced lambda that is none no step is finite, and the loop ends.
-        lost = jnp.isnan(new.state.smoothing)
-        good = lost | ((gain > 0) & is_plausible(state, gain, longest_move))
-        damping = jnp.where(new.step == 1, self.damping, next_damping(state, objective, gain, good))
-        origin = eqx.tree_at(lambda i: i.surface, old, state.origin)
-        kept = lax.cond(
-            good,
-            lambda: (new.surface, here, state.energy),
-            lambda: (origin.surface, before, old.state.damping.energy),
-        )
-        surface, projection, energy = kept
+        lost = jnp.isnan(state.smoothing)
+        good = better = lost | ((gain > 0) & is_plausible(damped, gain, longest_move))
+        guard = state.guard
+        if guard is not None:
+            good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
+            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order)
+        # A step that folds is taken again with more smoothing there, not with more damping everywhere.
+        following = jnp.where(better & ~good, damped.damping, next_damping(damped, objective, gain, better))
+        following = jnp.where(new.step == 1, self.damping, following)
+        kept = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
+        surface, projection = kept
         projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
-        rejected = state.rejected_steps + ~good
-        damped = DampingState(surface, energy, state.predicted, damping, rejected)
-        return Iterate(
-            surface, projection, OrthogonalState(new.state.smoothing, damped, new.state.plate), new.step
-        )
+        damped = DampingState(surface, damped.predicted, following, damped.rejected_steps + ~good)
+        state = OrthogonalState(damped, state.penalty, guard, state.smoothing, state.plate)
+        return Iterate(surface, projection, state, new.step)
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """New knots if it is time, and a step that `accept` decides on once it has been measured."""
-        here, damping = iterate.projection, iterate.state.damping
-        surface = self._refined(problem, iterate)
+        here, state = iterate.projection, iterate.state
+        surface, guard = self._refined(problem, iterate)
+        damping = state.damping.damping
         net, axes = surface.control_points, surface.axes
         length = loss_length(self.loss, problem, here.error)
         weight = reweighted(self.loss, length, problem.weight, here.error)
         held = held_points(self.border, net.shape, surface.used)
+        if guard is not None:
+            held = held | (guard.held > 0)
         always = problem.diagonal > 0
         feet = (here.u, here.v, weight)
         equations = materialise(
             always,
             lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
-            *(net, *feet, damping.damping),
+            *(net, *feet, damping),
         )
+        if guard is None:
+            penalty: Any = WeightedPlate(plate_of(state.plate, surface), state.smoothing)
+        else:
+            size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
+            penalty = self.smoothing.penalty(guard, surface, size)
 
         def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
             return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
 
-        solve = partial(
-            gauss_newton_step,
-            plate_of(iterate.state.plate, surface),
-            iterate.state.smoothing,
-            self.reach,
-            correction_rhs,
-        )
-        following, predicted = materialise(always, solve, equations, net, held, damping.damping)
-        lost = jnp.isnan(iterate.state.smoothing)  # a traced lambda that is none
+        def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
+            return gauss_newton_step(penalty, self.reach, correction_rhs, *x)
+
+        following, predicted = materialise(always, solve, penalty, equations, net, held, damping)
+        lost = jnp.isnan(state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
-        damped = DampingState(surface, damping.energy, predicted, damping.damping, damping.rejected_steps)
-        state = OrthogonalState(iterate.state.smoothing, damped, iterate.state.plate)
+        damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)
+        state = OrthogonalState(damped, penalty, guard, state.smoothing, state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
-    def _refined(self, problem: Problem, iterate: Iterate) -> WorkingSurface:
+    def _refined(self, problem: Problem, iterate: Iterate) -> tuple[WorkingSurface, FoldGuard | None]:
         """The accepted surface, with new knots if it is time; they change neither it nor its feet."""
+        surface, guard = iterate.surface, iterate.state.guard
         if self.insertion is None:
-            return iterate.surface
+            return surface, guard
         refine = partial(self.insertion, projection=iterate.projection, counted=problem.counted)
-        return lax.cond(
-            iterate.step > 0, lambda: refine(iterate.step, iterate.surface), lambda: iterate.surface
-        )
+        refined = lax.cond(iterate.step > 0, lambda: refine(iterate.step, surface), lambda: surface)
+        if guard is not None:
+            grown = jnp.any(jnp.asarray(refined.used) > jnp.asarray(surface.used))
+            guard = lax.cond(grown, lambda: self.smoothing.renewed(guard, refined), lambda: guard)
+        return refined, guard
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array
@@ -259,9 +293,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
         """The iterate as it is; lambda, the integral (10), the last damping and the rejected steps."""
         state, surface = iterate.state, iterate.surface
         energy = plate_of(state.plate, surface).energy(surface.control_points)
-        return iterate, {
-            "smoothing": state.smoothing,
+        stats = {
+            **({} if state.guard is None else {"guard": state.guard}),
             "bending_energy": energy * problem.scale**2,
             "damping": state.damping.damping,
             "rejected_steps": state.damping.rejected_steps,
         }
+        if state.guard is None:
+            return iterate, {"smoothing": state.smoothing / jnp.sum(problem.weight), **stats}
+        return iterate, stats

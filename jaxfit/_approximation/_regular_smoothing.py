@@ -1,0 +1,134 @@
+r"""`RegularSmoothing`: smoothing that follows the errors and is raised where a step would fold the surface."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._approximation._folds import folds_by_cell, near_folds
+from jaxfit._checks import check_number
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._normal_equations import Roughness
+
+LONGEST_HOLD = 63.0  # accepted steps for which control points stay, around folds that come again and again
+STUCK = 4.0  # times the least factor, around folds that a step has not removed
+RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
+FLOOR_FALL = 0.95  # at once: it falls by this with every accepted step
+
+
+class RegularSmoothing(eqx.Module):
+    r"""Smoothing relative to the tangents, as strong as the errors allow, stronger where a fold threatens.
+
+    The smoothing term is
+
+    $$\rho \sum_{ij} c_{ij} \Big(\frac{|D_{uu}|^2}{|D_u|^2}
+      + |D_{uv}|^2 \Big(\frac1{|D_u|^2} + \frac1{|D_v|^2}\Big) + \frac{|D_{vv}|^2}{|D_v|^2}\Big),$$
+
+    with differences D of the net at each control point, those in the denominators being of the net before the
+    step. These are squared angles: how much the normal turns and the tangents change from one control point
+    to the next. The thin plate is slack where the net is narrow, for there second derivatives are
+    small; this term is not.
+
+    $\rho$ is the mean square of the distances. So the whole objective, divided by it, compares numbers
+    without unit: smoothing falls to nothing where all points can be met, and does not depend on the number
+    of points, their unit, or the size of the net.
+
+    The factors $c_{ij}$ fall from `first` to `least` from step to step. A step after which the surface would
+    have more folds than before is rejected, and the factors around the new ones are raised; they fall again,
+    but not so far. A surface without folds therefore remains so, on the samples: 8 in each
+    direction of a cell, whose normals may turn by 60 degrees from one to the next.
+
+    Parameters
+    ----------
+    least : float
+        The factor where nothing folds (default 8). 8 means that a bend of a third of a radian between two
+        control points counts as one point at the usual distance.
+    first : float
+        The factor of the first step (default 100).
+    fall : float
+        The factor of the next step over that of an accepted one, between 0 and 1 (default 0.7).
+    raised : float
+        By how much factors are raised around a fold, more than 1 (default 2).
+    most : float
+        The greatest factor (default 1000).
+
+    Raises
+    ------
+    ValueError
+        If an option is out of range.
+
+    Examples
+    --------
+    >>> jf.OrthogonalDistance(smoothing=jf.RegularSmoothing(least=1.0)).smoothing.least
+    1.0
+    """
+
+    least: float = 8.0
+    first: float = 100.0
+    fall: float = 0.7
+    raised: float = 2.0
+    most: float = 1000.0
+
+    def __check_init__(self) -> None:
+        for name in ("least", "first", "fall", "raised", "most"):
+            check_number(name, getattr(self, name), 0.0)
+        if not 0 < self.least <= self.first <= self.most:
+            raise ValueError(
+                "least, first and most must be positive and not decrease, but are "
+                f"{self.least!r}, {self.first!r} and {self.most!r}; the defaults are 8, 100 and 1000."
+            )
+        if not 0 < self.fall < 1 < self.raised:
+            raise ValueError(
+                f"fall must lie between 0 and 1 and raised be greater than 1, but they are {self.fall!r} "
+                f"and {self.raised!r}; the defaults are 0.7 and 2."
+            )
+
+    def begin(self, shape: tuple[int, ...], cells: tuple[int, int], dtype: Any) -> "FoldGuard":
+        """Before the first step."""
+        factor, floor, zero = (np.full(shape, x, dtype) for x in (self.first, self.least, 0.0))
+        return FoldGuard(factor, floor, zero, zero, np.zeros(cells, dtype))
+
+    def penalty(self, guard: "FoldGuard", surface: WorkingSurface, size: Array) -> Roughness:
+        """The smoothing term of a step from a surface whose distances have the mean square `size`."""
+        knots = surface.knots_u, surface.knots_v
+        return Roughness.of(surface.control_points, *knots, size * guard.factor)
+
+    def after(
+        self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any
+    ) -> "FoldGuard":
+        """The factors after a step: `better` if its objective is lower, `good` if also accepted."""
+        fresh = near_folds(jnp.maximum(new.folds - old.folds, 0.0), order) & better & ~good
+        kept = near_folds(jnp.minimum(new.folds, old.folds), order) & good
+        factor = jnp.asarray(new.factor)
+        floor = jnp.where(fresh, jnp.clip(RAISED_FLOOR * factor, new.floor, self.most), new.floor)
+        floor = jnp.where(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
+        factor = jnp.where(good, jnp.maximum(self.fall * factor, floor), factor)
+        factor = jnp.where(fresh, jnp.minimum(self.raised * factor, self.most), factor)
+        factor = jnp.where(kept, jnp.maximum(factor, STUCK * self.least), factor)
+        holds = jnp.where(fresh, jnp.minimum(2.0 * new.holds + 1.0, LONGEST_HOLD), new.holds)
+        held = jnp.where(fresh, holds, jnp.where(good, jnp.maximum(new.held - 1.0, 0.0), new.held))
+        return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))
+
+    def renewed(self, guard: "FoldGuard", surface: WorkingSurface) -> "FoldGuard":
+        """For a surface whose new knots have moved the control points in the net."""
+        least = jnp.full_like(guard.factor, self.least)
+        return FoldGuard(least, least, *(jnp.zeros_like(least),) * 2, guard.folds).seeing(surface)
+
+
+class FoldGuard(eqx.Module):
+    """Of each control point the factor, what it does not fall below, and the share of its move in the next step;
+    and the folds of the surface by cell.
+    """
+
+    factor: Float[Any, "nu nv"]
+    floor: Float[Any, "nu nv"]
+    holds: Float[Any, "nu nv"]
+    held: Float[Any, "nu nv"]
+    folds: Float[Any, "cells_u cells_v"]
+
+    def seeing(self, surface: WorkingSurface) -> "FoldGuard":
+        """With the folds of this surface."""
+        return FoldGuard(self.factor, self.floor, self.holds, self.held, folds_by_cell(surface.pieces))
