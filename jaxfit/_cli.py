@@ -225,4 +225,8 @@ def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, ma
 
 def _describe(data: io.PointData) -> str:
     count = f"{len(data.cloud):,}"
-    return count if data.grid is None else "{} (grid {} x {})".format(count, *data.grid.shape)
+    notes = [] if data.grid is None else ["grid {} x {}".format(*data.grid.shape)]
+    if data.left_out:
+        reasons = (f"{count:,} {reason}" for reason, count in data.left_out.items())
+        notes.append(f"left out: {', '.join(reasons)}")
+    return f"{count} ({'; '.join(notes)})" if notes else count
