@@ -20,6 +20,8 @@ INPUT   .npz  'grid' (n, m, 3), or 'points' (N, 3) with 'boundary_v0', 'boundary
         jacksboro       the terrain inside Matplotlib
 OUTPUT  .npz  control_points, knots_u, knots_v, order
         .json geomdl's exchange format
+        .step .stp .iges .igs .3dm  for CAD
+        .ply .stl .obj  triangles
 """
 _EPILOG = """\
 exit codes:

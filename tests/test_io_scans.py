@@ -1,13 +1,10 @@
 """Scanners' files and meshes are read exactly; what they mark as no measurement is left out and counted."""
 
-import subprocess
 import sys
 
 import numpy as np
 import pytest
-from helpers import CHECKOUT
 
-from jaxfit import _cli
 from jaxfit.io import InputError, read_points
 
 FAR = np.array([500_000.0, 5_200_000.0, 250.0])  # a place on earth, in metres
@@ -256,37 +253,3 @@ def test_a_missing_library_is_one_sentence(tmp_path, monkeypatch, suffix, module
     with pytest.raises(InputError) as caught:
         read_points(tmp_path / f"a.{suffix}")
     assert str(caught.value) == said
-
-
-def test_the_core_loads_no_library_of_an_extra(tmp_path):
-    program = """
-import sys
-import numpy as np
-import jaxfit as jf
-np.savez("a.npz", grid=np.random.default_rng(0).random((5, 4, 3)))
-jf.io.read_points("a.npz")
-net = np.array([[[0.0, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 1]]])
-jf.io.write_surface("a.json", jf.BSplineSurface(net, [0.0, 0, 1, 1], [0.0, 0, 1, 1]))
-extra = {"OCP", "trimesh", "laspy", "lazrs", "pye57", "pypcd4", "rhino3dm", "gmsh"} & set(sys.modules)
-assert not extra, extra
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(CHECKOUT), "JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_command_says_what_was_left_out(tmp_path, monkeypatch, capsys):
-    need("trimesh")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
-    x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
-    grid = np.stack([x, y, 0.1 * x * y], axis=-1).reshape(-1, 3)
-    ply(tmp_path / "grid.ply", np.concatenate([grid, np.full((2, 3), np.nan)]))
-    assert _cli.main("fit grid.ply -o s.npz --grid 6x5 --no-picture".split()) == 0
-    assert "30 (grid 6 x 5; left out: 2 not finite)" in capsys.readouterr().out
