@@ -288,6 +288,20 @@ def test_triangles_far_away_are_centred(tmp_path, suffix):
     assert b"add to coordinates: 500100.0 5200100.0 0.0" in (tmp_path / f"s.{suffix}").read_bytes()[:300]
 
 
+def test_a_span_that_is_an_s_is_cut_into_pieces():
+    from jaxfit.io._nets import clamped_net
+    from jaxfit.io._tessellation import tessellate
+
+    net = wavy_net(4, 2, height=0.0)
+    net[:, :, 2] = np.array([0.0, 1.0, -1.0, 0.0])[:, None]  # its middle is on the chord
+    surface = on_uniform_knots(net, (4, 2))
+    vertices, triangles = tessellate(clamped_net(surface))
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    assert 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() == pytest.approx(
+        area(surface), rel=1e-3
+    )
+
+
 def test_a_pole_makes_no_triangle_without_area():
     from jaxfit.io._nets import clamped_net
     from jaxfit.io._tessellation import tessellate

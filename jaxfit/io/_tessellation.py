@@ -46,14 +46,16 @@ def tessellate(
 ) -> tuple[Vertices, Triangles]:
     """Vertices on a grid of parameters and triangles between them, whose normals are along R_u x R_v.
 
-    Every span of the knots is cut into the same number of pieces: the least power of two for which the
-    triangles stay within `deviation` of the surface, as a fraction of the diagonal, measured at the middles
-    of their sides; or the largest with at most `most` vertices. Triangles without an area are left out.
+    Every span of the knots is cut into the same number of pieces, which is doubled until the triangles are
+    within `deviation` of the surface, as a fraction of the diagonal, halfway along their sides, or until
+    doubling would make more than `most` vertices. Triangles without an area are left out.
     """
-    pieces, points = 1, _points(net, 1)
-    while True:
+    # At first as many pieces as a polynomial has turns: the middle of an S is on its chord.
+    pieces = max(1, max(net.order) - 2)
+    points = _points(net, pieces)
+    while (2 * points.shape[0] - 1) * (2 * points.shape[1] - 1) <= most:
         finer = _points(net, 2 * pieces)
-        if _deviation(finer) <= deviation * net.diagonal or finer[..., 0].size > most:
+        if _deviation(finer) <= deviation * net.diagonal:
             break
         pieces, points = 2 * pieces, finer
     index = np.arange(points[..., 0].size).reshape(points.shape[:2])
@@ -77,11 +79,21 @@ def _points(net: ClampedNet, pieces: int) -> Float[np.ndarray, "a b 3"]:
 
 
 def _deviation(points: Float[np.ndarray, "a b 3"]) -> float:
-    """How far every second point is from the middle of a side of the triangles between the others."""
+    """Distances of the points halfway along the sides of the triangles between every second point."""
     coarse = points[::2, ::2]
-    gaps = (
-        points[1::2, ::2] - 0.5 * (coarse[1:] + coarse[:-1]),
-        points[::2, 1::2] - 0.5 * (coarse[:, 1:] + coarse[:, :-1]),
-        points[1::2, 1::2] - 0.5 * (coarse[1:, 1:] + coarse[:-1, :-1]),
+    sides = (
+        (points[1::2, ::2], coarse[:-1], coarse[1:]),
+        (points[::2, 1::2], coarse[:, :-1], coarse[:, 1:]),
+        (points[1::2, 1::2], coarse[:-1, :-1], coarse[1:, 1:]),
     )
-    return max(float(np.linalg.norm(gap, axis=2).max()) for gap in gaps)
+    return max(float(_distances(*side).max()) for side in sides)
+
+
+def _distances(
+    points: Float[np.ndarray, "a b 3"], start: Float[np.ndarray, "a b 3"], end: Float[np.ndarray, "a b 3"]
+) -> Float[np.ndarray, "a b"]:
+    """From line segments."""
+    side, gap = end - start, points - start
+    squared = np.maximum(np.sum(side * side, axis=2), np.finfo(float).tiny)
+    along = np.clip(np.sum(side * gap, axis=2) / squared, 0.0, 1.0)
+    return np.linalg.norm(gap - along[..., None] * side, axis=2)
