@@ -86,7 +86,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
         seconds = time.perf_counter() - before
     if not (math.isfinite(average) and math.isfinite(maximum)):
         return _fail(f"the fit failed: {fit.message}", FAILED)
-    io.write_surface(args.output, fit.surface)
+    offset = io.write_surface(args.output, fit.surface)
     if picture:
         from jaxfit.plot import surface_and_errors
 
@@ -102,6 +102,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
                 "method": f"{method}, {'single' if args.float32 else 'double'} precision",
                 "time": f"fit {seconds:.2f} s, total {total:.2f} s",
                 "written": ", ".join(str(path) for path in (args.output, picture) if path),
+                **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),
             }
         )
     return REACHED if _reached(args, method, fit, average, maximum) else NOT_REACHED
@@ -225,4 +226,8 @@ def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, ma
 
 def _describe(data: io.PointData) -> str:
     count = f"{len(data.cloud):,}"
-    return count if data.grid is None else "{} (grid {} x {})".format(count, *data.grid.shape)
+    notes = [] if data.grid is None else ["grid {} x {}".format(*data.grid.shape)]
+    if data.left_out:
+        reasons = (f"{count:,} {reason}" for reason, count in data.left_out.items())
+        notes.append(f"left out: {', '.join(reasons)}")
+    return f"{count} ({'; '.join(notes)})" if notes else count

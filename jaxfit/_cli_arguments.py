@@ -16,9 +16,12 @@ INPUT   .npz  'grid' (n, m, 3), or 'points' (N, 3) with 'boundary_v0', 'boundary
               'boundary_u0', 'boundary_u1' (polylines)
         .npy  (n, m, 3) grid or (N, 3) scattered points
         .csv .xyz .txt  scattered points, one x y z a line
+        .ply .stl .obj .off .las .laz .e57 .pcd  scattered points or the vertices of a mesh
         jacksboro       the terrain inside Matplotlib
 OUTPUT  .npz  control_points, knots_u, knots_v, order
         .json geomdl's exchange format
+        .step .stp .iges .igs .3dm  for CAD
+        .ply .stl .obj  triangles
 """
 _EPILOG = """\
 exit codes:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxfit as jf
+import jaxfit.io
 
 PUBLIC = {
     name: value
@@ -44,3 +45,11 @@ def test_examples_are_true(room):
             doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
             assert not report, "".join(report)
     assert not without
+
+
+@pytest.mark.parametrize("name", ["read_points", "write_surface"])
+def test_examples_of_files_are_true(name):
+    (test,) = examples(name, getattr(jf.io, name))
+    report = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
+    assert not report, "".join(report)

@@ -93,11 +93,13 @@ def test_importing_the_package_is_light_and_changes_no_configuration():
     program = """
 import sys, jax
 before = dict(jax.config.values)
-import jaxfit
+import jaxfit, jaxfit.io
 # The command line switches to double precision after this, so no array may exist yet.
 assert not jax.live_arrays(), jax.live_arrays()
 heavy = {"matplotlib", "jaxopt", "optimistix", "scipy.spatial", "scipy.interpolate", "rich"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
+extra = {"OCP", "rhino3dm", "trimesh", "laspy", "lazrs", "pye57", "pypcd4"}
+assert not extra & set(sys.modules), extra & set(sys.modules)
 assert dict(jax.config.values) == before
 """
     done = subprocess.run(

@@ -118,7 +118,7 @@ def test_scattered_points_can_be_read_as_a_grid(tmp_path):
 def test_files_that_are_not_there(tmp_path):
     assert "does not exist" in sentence(tmp_path / "none.npz")
     assert "is a folder" in sentence(tmp_path)
-    assert "suffix .stl" in sentence(text(tmp_path / "a.stl", "solid"))
+    assert "suffix .dwg" in sentence(text(tmp_path / "a.dwg", "AC10"))
     assert "no suffix" in sentence(text(tmp_path / "points", "0 0 0"))
 
 

@@ -104,8 +104,8 @@ def test_surfaces_that_are_not_finite_are_not_written(tmp_path):
 
 
 def test_outputs_are_refused_before_any_work(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"the suffix \.stl"):
-        check_output(tmp_path / "s.stl")
+    with pytest.raises(InputError, match=r"the suffix \.dwg"):
+        check_output(tmp_path / "s.dwg")
     with pytest.raises(InputError, match="no suffix"):
         check_output(tmp_path / "s")
     with pytest.raises(InputError, match="does not exist"):

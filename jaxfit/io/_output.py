@@ -3,10 +3,18 @@
 import os
 from pathlib import Path
 
+from jaxfit.io._extras import import_extra
 from jaxfit.io._point_data import InputError
 
+LIBRARIES = {  # of the extra `cad`
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs"), "OCP"),
+    ".3dm": "rhino3dm",
+    **dict.fromkeys((".ply", ".stl", ".obj"), "trimesh"),
+}
+_SURFACES = (".npz", ".json", *LIBRARIES)
 
-def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = (".npz", ".json")) -> None:
+
+def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = _SURFACES) -> None:
     """Raise now if `path` cannot be written later, before a long fit is spent on it.
 
     Parameters
@@ -14,13 +22,13 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = (".npz", "
     path
         The file to be written. An existing file is left alone here and replaced later.
     suffixes
-        The formats that can be written.
+        The formats that can be written; by default those of surfaces.
 
     Raises
     ------
     InputError
-        For an unknown suffix, a missing folder, a folder in place of a file, and a folder in
-        which no file can be made.
+        For an unknown suffix, a library that is not installed, a missing folder, a folder in place of a
+        file, and a folder in which no file can be made.
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:
@@ -42,6 +50,8 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = (".npz", "
         ) from error
     finally:
         part.unlink(missing_ok=True)
+    if (suffix := path.suffix.lower()) in LIBRARIES:
+        import_extra(LIBRARIES[suffix], suffix, "cad")
 
 
 def write_atomically(path: str | os.PathLike, content: bytes) -> None:

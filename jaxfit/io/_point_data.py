@@ -1,6 +1,7 @@
 """What a file of points holds, and the error that says what is wrong with it."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -29,12 +30,17 @@ class PointData:
         point). None when nothing is known about the border.
     name
         Short name for tables and titles: the file's name without folder and suffix.
+    left_out
+        Of a scanner's file or a mesh: how many of its points are not in `points`, by reason; empty if
+        all are. The reasons are "withheld" and "classified as noise" (LAS), "invalid" (E57),
+        "not finite", and of meshes "in no face" and "repeated".
     """
 
     points: Float[np.ndarray, "points 3"] | None
     grid: Float[np.ndarray, "n m 3"] | None
     boundary: Boundary | None
     name: str
+    left_out: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @property
     def cloud(self) -> Float[np.ndarray, "points 3"]:
@@ -58,7 +64,7 @@ class PointData:
                 f"{self.name} holds {len(cloud)} points, which do not make a {n} x {m} grid of "
                 f"{n * m}; give the grid's true size."
             )
-        return grid_data(cloud.reshape(n, m, 3), self.name)
+        return dataclasses.replace(grid_data(cloud.reshape(n, m, 3), self.name), left_out=self.left_out)
 
 
 def grid_data(grid: Float[np.ndarray, "n m 3"], name: str, path: object = None) -> PointData:

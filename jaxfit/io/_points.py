@@ -12,11 +12,12 @@ from jaxtyping import Float
 from jaxfit._base import Boundary
 from jaxfit.io._arrays import load_arrays
 from jaxfit.io._point_data import InputError, PointData, grid_data
+from jaxfit.io._scans import SCANS, read_scan
 from jaxfit.io._text import read_columns
 
 BOUNDARY_KEYS = ("boundary_v0", "boundary_v1", "boundary_u0", "boundary_u1")
 _KEYS = ("grid", "points", *BOUNDARY_KEYS)
-SUFFIXES = (".npz", ".npy", ".csv", ".xyz", ".txt")
+SUFFIXES = (".npz", ".npy", ".csv", ".xyz", ".txt", *SCANS)
 _LEAST_POINTS = 4
 
 
@@ -34,10 +35,19 @@ def read_points(path: str | os.PathLike) -> PointData:
     ``.csv``            scattered, one point a line, commas; a first line of names
                         is skipped
     ``.xyz``, ``.txt``  the same with blanks instead of commas
+    ``.ply``, ``.stl``  the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
+    ``.obj``, ``.off``  ``.off`` without faces (trimesh)
+    ``.las``, ``.laz``  a survey, with the scale and offset of the file (laspy, lazrs)
+    ``.e57``            all scans, in the frame of the file (pye57)
+    ``.pcd``            fields x, y and z (pypcd4)
     ==================  ===========================================================
 
     Columns after the third are ignored everywhere, blank lines and lines that begin with ``#``
-    in text files. Coordinates become float64.
+    in text files. Coordinates become float64; units and large offsets stay as they are.
+
+    The formats of the last four rows need the extra ``scan``. Some of them say of points that they are no
+    measurements, by a flag or by NaN, and meshes may repeat a vertex (STL: in every triangle). Such points
+    are left out and counted in `PointData.left_out`. In NumPy's and text files NaN is an error.
 
     Parameters
     ----------
@@ -51,15 +61,27 @@ def read_points(path: str | os.PathLike) -> PointData:
     Raises
     ------
     InputError
-        For a missing or unreadable file, an unknown suffix, arrays of the wrong shape, text that
-        holds no numbers, NaN or infinite coordinates, fewer than four points, and a boundary
-        that is incomplete or whose corners do not meet.
+        For a missing or unreadable file, an unknown suffix, a library that is not installed, arrays of
+        the wrong shape, text that holds no numbers, NaN or infinite coordinates in NumPy's and text files,
+        fewer than four points, and a boundary that is incomplete or whose corners do not meet.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "four.xyz"
+    >>> _ = path.write_text("0 0 0\\n1 0 0\\n0 1 0\\n1 1 0.5\\n")
+    >>> data = jf.io.read_points(path)
+    >>> data.points.shape, data.boundary, data.left_out
+    ((4, 3), None, {})
     """
     path = Path(path)
     suffix = path.suffix.lower()
     check_input(path, SUFFIXES)
     if suffix in (".csv", ".xyz", ".txt"):
         return _from_array(read_columns(path), "points", path)
+    if suffix in SCANS:
+        points, left_out = read_scan(path)
+        return dataclasses.replace(_from_array(points, "points", path), left_out=left_out)
     arrays, names = load_arrays(path, _KEYS)
     if suffix == ".npy" and "array" in arrays:
         array = arrays["array"]

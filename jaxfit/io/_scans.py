@@ -1,0 +1,147 @@
+"""Points of scanners' files and of meshes, by the libraries of the extra `scan`.
+
+What a file itself marks as no measurement is left out and counted.
+"""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.io._extras import import_extra
+from jaxfit.io._point_data import InputError
+
+Counts = dict[str, int]
+Points = Float[np.ndarray, "points 3"]
+
+_NOISE = (7, 18)  # LAS classes: low and high noise
+
+
+def read_scan(path: Path) -> tuple[Points, Counts]:
+    """The points of a file, float64, in file order, and how many were left out for which reason.
+
+    Raises
+    ------
+    InputError
+        If the library is missing, or the file is damaged or holds no points in three dimensions.
+    """
+    suffix = path.suffix.lower()
+    modules, read = _READERS[suffix]
+    libraries = [import_extra(module, suffix, "scan") for module in modules]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            points, left_out = read(path, libraries[0])
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or _one_line(error)}.") from error
+    except MemoryError as error:
+        raise InputError(f"{path} holds more than there is memory for; thin the points.") from error
+    except Exception as error:  # a parser may raise anything on a damaged file
+        raise InputError(
+            f"{path} is no {suffix} file that can be read ({_one_line(error)}); write it again."
+        ) from error
+    return points, {reason: count for reason, count in left_out.items() if count}
+
+
+def _finite(points: Points) -> Bool[np.ndarray, " points"]:
+    return np.isfinite(points).all(axis=1)
+
+
+def _las(path: Path, laspy: Any) -> tuple[Points, Counts]:
+    las = laspy.read(path)
+    points = _columns(las.x, las.y, las.z)  # scaled and shifted in float64
+    _check_count(path, len(points), las.header.point_count)
+    withheld = np.asarray(las.withheld, bool)
+    noise = np.isin(np.asarray(las.classification), _NOISE) & ~withheld
+    kept = ~withheld & ~noise
+    finite = _finite(points)
+    return points[kept & finite], {
+        "withheld": int(withheld.sum()),
+        "classified as noise": int(noise.sum()),
+        "not finite": int((kept & ~finite).sum()),
+    }
+
+
+def _e57(path: Path, pye57: Any) -> tuple[Points, Counts]:
+    """All scans of a file, each in the frame of the file."""
+    with pye57.E57(str(path)) as file:
+        claimed, scans = 0, []
+        for i in range(file.scan_count):
+            claimed += file.get_header(i).point_count
+            scan = file.read_scan(i, ignore_missing_fields=True)  # without points marked as invalid
+            scans.append(_columns(*(scan[f"cartesian{axis}"] for axis in "XYZ")))
+    points = np.concatenate([np.empty((0, 3)), *scans])
+    finite = _finite(points)
+    return points[finite], {"invalid": claimed - len(points), "not finite": int((~finite).sum())}
+
+
+def _pcd(path: Path, pypcd4: Any) -> tuple[Points, Counts]:
+    cloud = pypcd4.PointCloud.from_path(path)
+    missing = [axis for axis in "xyz" if axis not in cloud.fields]
+    if missing:
+        raise InputError(f"{path} holds no {' and no '.join(missing)}; write x, y and z for every point.")
+    points = _columns(*(np.atleast_1d(cloud.pc_data[axis]) for axis in "xyz"))
+    _check_count(path, len(points), cloud.metadata.points)
+    finite = _finite(points)
+    return points[finite], {"not finite": int((~finite).sum())}
+
+
+def _mesh(path: Path, trimesh: Any) -> tuple[Points, Counts]:
+    """The vertices of a mesh, each once; all points of a file without faces."""
+    options = {"process": False, "maintain_order": True, "skip_materials": True}
+    scene = trimesh.load_scene(str(path), **options)
+    pieces, used, has_faces = [np.empty((0, 3))], [np.empty(0, bool)], False
+    for geometry in scene.geometry.values():
+        vertices = np.asarray(geometry.vertices, np.float64)
+        faces = np.asarray(getattr(geometry, "faces", ()), int)
+        referenced = np.full(len(vertices), not len(faces))
+        referenced[faces.reshape(-1)] = True
+        pieces.append(vertices)
+        used.append(referenced)
+        has_faces |= len(faces) > 0
+    points, in_face = np.concatenate(pieces), np.concatenate(used)
+    finite = _finite(points)
+    kept = points[in_face & finite]
+    left_out = {"in no face": int((~in_face).sum()), "not finite": int((in_face & ~finite).sum())}
+    if has_faces:
+        first = _first_of_equals(kept)
+        left_out["repeated"] = int((~first).sum())
+        kept = kept[first]
+    return kept, left_out
+
+
+def _first_of_equals(points: Points) -> Bool[np.ndarray, " points"]:
+    """Which points equal none before them, to the last bit."""
+    order = np.lexsort(points.T)  # stable: among equals the first comes first
+    ordered = points[order]
+    first = np.ones(len(points), bool)
+    first[order[1:]] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    return first
+
+
+def _columns(x: Any, y: Any, z: Any) -> Points:
+    return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=1)
+
+
+def _check_count(path: Path, count: int, claimed: int) -> None:
+    if count != claimed:
+        raise InputError(f"{path} claims {claimed} points, but holds {count}; it was cut, so write it again.")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+
+
+_Reader = Callable[[Path, Any], tuple[Points, Counts]]
+_READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
+    **dict.fromkeys((".ply", ".stl", ".obj", ".off"), (("trimesh",), _mesh)),
+    **dict.fromkeys((".las", ".laz"), (("laspy", "lazrs"), _las)),
+    ".e57": (("pye57",), _e57),
+    ".pcd": (("pypcd4",), _pcd),
+}
+SCANS = tuple(_READERS)
