@@ -35,7 +35,7 @@ def checked_request(
     """
     check_switch("throw", throw)
     if method is not None:
-        check_kind("method", method, AbstractIterativeMethod, "GeometricApproximation()")
+        check_kind("method", method, AbstractIterativeMethod, "OrthogonalDistance()")
     if errors is not None:
         check_kind("errors", errors, AbstractErrors, "GlobalFeet()")
     check_steps("max_steps", max_steps)

@@ -47,8 +47,8 @@ from jaxfit._splines._pieces import pieces_on
 class OrthogonalState(eqx.Module):
     """The damping of the steps and the smoothing term of the last one.
 
-    With RegularSmoothing() there is a `guard`, without it lambda, `smoothing`, against the sum of the weights,
-    and the thin plate of a fit that keeps its knots.
+    With RegularSmoothing() there is a `guard`; without it lambda, `smoothing`, against the sum of the
+    weights. `plate` is the thin plate of a fit that keeps its knots.
     """
 
     damping: DampingState
@@ -63,14 +63,15 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     With the closest point $u_k^*(P)$ of every point eliminated, minimises
 
-    $$F = \sum_k w_k |Q_k - R(u_k^*(P))|^2 + \lambda F_s(P),$$
+    $$F = \sum_k w_k |Q_k - R(u_k^*(P))|^2 + S(P),$$
 
-    $F_s$ being the thin-plate energy (10) of `StandardApproximation`. That method holds the parameters while
+    with a smoothing term S, a quadratic form $P^T A_S P$: by default that of `RegularSmoothing`, or the
+    thin-plate energy (10) times $\lambda \sum_k w_k$. `StandardApproximation` holds the parameters while
     it solves, so that a point resists every move of the surface. Here a point resists only moves along the
     normal $n_k$; the net may slide along the surface. Each step solves
 
-    $$\Big(\sum_k w_k B_k^T (\Pi_k + \mu (I - \Pi_k)) B_k + \lambda A_{fair}\Big)\, \delta P
-      = \sum_k w_k B_k^T (Q_k - R_k) - \lambda A_{fair} P,$$
+    $$\Big(\sum_k w_k B_k^T (\Pi_k + \mu (I - \Pi_k)) B_k + A_S\Big)\, \delta P
+      = \sum_k w_k B_k^T (Q_k - R_k) - A_S P,$$
 
     with the basis functions $B_k$ at the foot and the projection $\Pi_k$ on the normal space, for a surface
     in space $n_k n_k^T$. At a foot on the border of the domain $\Pi_k$ removes only the tangent directions in
@@ -87,12 +88,16 @@ class OrthogonalDistance(AbstractIterativeMethod):
     follows the ratio of the actual to the predicted reduction of F. A step is rejected if F, measured at
     converged feet, has not fallen; so F never rises. It is also rejected if a foot has moved by several cells
     and the reduction is less than predicted. A rejected step counts as an iteration, with the errors of the
-    surface before it. F is measured at local feet.
+    surface before it. F is measured at local feet. With `RegularSmoothing` a step is also rejected if the
+    surface would fold where it did not, and taken again with more smoothing there.
 
     Parameters
     ----------
-    smoothing : float
-        lambda (default 5e-6), as for `StandardApproximation`; 0 for none. May be traced.
+    smoothing : RegularSmoothing() or float
+        Default RegularSmoothing(), which keeps a surface without folds free of them and fades as the errors
+        fall. A number is lambda of the thin plate, weighed against the mean over the points, so that it
+        means the same for any number of them: `sum(weights)` times it is lambda of `StandardApproximation`
+        and of the paper, weighed against the sum. 0 for none. A number may be traced.
     border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
         Which control points on the border of the net stay (default all of them, section 2.3 of the paper).
     insertion : KnotInsertion(), optional
@@ -116,12 +121,13 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     Notes
     -----
-    The fit's `stats` contain `smoothing`; `bending_energy`, $F_s$ in the squared unit of the data; `damping`,
-    the last mu; and `rejected_steps`, the number of rejected steps.
+    The fit's `stats` contain `bending_energy`, the integral (10) in the squared unit of the data; `damping`,
+    the last mu; `rejected_steps`, the number of rejected steps; and of a thin plate `smoothing`, lambda.
 
-    Like the paper's methods this one may fold a surface whose base is too far from the points, or whose net
-    is too coarse. A base made with the points (`Meshless`, `DynamicBaseSurface`) or a finer net is the
-    remedy. Where smoothing is 0, control points that influence few points may move far.
+    Folds of the base surface may stay, and with a thin plate or without smoothing new ones may form where
+    the base is far from the points, the net too coarse, or the points lie in a pocket under the sheet. A
+    base made with the points (`Meshless`, `DynamicBaseSurface`) or a finer net is the remedy. Where smoothing
+    is 0, control points that influence few points may move far.
 
     This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,
@@ -134,8 +140,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     Examples
     --------
     >>> method = jf.OrthogonalDistance(loss=jf.Huber(), border=jf.FixedCorners())
-    >>> method.smoothing, method.damping, method.reach
-    (5e-06, 0.01, 0.6)
+    >>> method.smoothing.least, method.damping, method.reach
+    (8.0, 0.01, 0.6)
     >>> jf.OrthogonalDistance(damping=2.0)
     Traceback (most recent call last):
     ...

@@ -1,4 +1,4 @@
-r"""`RegularSmoothing`: smoothing that follows the errors and is raised where a step would fold the surface."""
+r"""`RegularSmoothing`: follows the errors, and is raised where a step would fold the surface."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ class RegularSmoothing(eqx.Module):
 
     The factors $c_{ij}$ fall from `first` to `least` from step to step. A step after which the surface would
     have more folds than before is rejected, and the factors around the new ones are raised; they fall again,
-    but not so far. A surface without folds therefore remains so, on the samples: 8 in each
+    but more slowly. A surface without folds therefore remains so, on the samples: 8 in each
     direction of a cell, whose normals may turn by 60 degrees from one to the next.
 
     Parameters
@@ -119,8 +119,8 @@ class RegularSmoothing(eqx.Module):
 
 
 class FoldGuard(eqx.Module):
-    """Of each control point the factor, what it does not fall below, and the share of its move in the next step;
-    and the folds of the surface by cell.
+    """Of each control point: the factor, what it does not fall below, for how many accepted steps the next
+    fold will hold it, and for how many it is held still; and the folds of the surface by cell.
     """
 
     factor: Float[Any, "nu nv"]
