@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -23,7 +24,6 @@ from jaxfit._approximation._losses import check_loss, loss_length, reweighted, t
 from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
-    WeightedPlate,
     as_smoothing,
     check_smoothing,
     constant_plate,
@@ -39,7 +39,7 @@ from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import ThinPlate
+from jaxfit._normal_equations import AbstractPenalty, ThinPlate, WeightedPlate
 from jaxfit._splines._pieces import pieces_on
 
 
@@ -51,7 +51,7 @@ class OrthogonalState(eqx.Module):
     """
 
     damping: DampingState
-    penalty: Any
+    penalty: AbstractPenalty
     guard: FoldGuard | None
     smoothing: Float[Any, ""]
     plate: ThinPlate | None
@@ -186,15 +186,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
         damping, total = first_damping(surface, dtype), problem.weight.sum()
         if isinstance(self.smoothing, RegularSmoothing):
-            cells = surface.axis_u.cells, surface.axis_v.cells
-            guard = self.smoothing.begin(surface.control_points.shape[:2], cells, dtype)
-            nothing = np.zeros((), dtype)
-            penalty = self.smoothing.penalty(guard, surface, nothing)
-            return surface, OrthogonalState(damping, penalty, guard, nothing, None)
-        plate, smoothing = (
-            constant_plate(self.insertion, surface),
-            as_smoothing(self.smoothing, dtype) * total,
-        )
+            guard, nothing = self.smoothing.begin(surface)
+            return surface, OrthogonalState(damping, nothing, guard, np.zeros((), dtype), None)
+        smoothing = as_smoothing(self.smoothing, dtype) * total
+        plate = constant_plate(self.insertion, surface)
         penalty = WeightedPlate(plate_of(plate, surface), smoothing)
         return surface, OrthogonalState(damping, penalty, None, smoothing, plate)
 
@@ -214,13 +209,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
         here, before = new.projection, old.projection
         # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        objective, after = (
-            total_cost(self.loss, length, problem.weight, error) + state.penalty.energy(net)
-            for error, net in (
-                (before.error, damped.origin.control_points),
-                (here.error, new.surface.control_points),
-            )
+        nets = jnp.stack([damped.origin.control_points, new.surface.control_points])
+        costs = jax.vmap(partial(total_cost, self.loss, length, problem.weight))(
+            jnp.stack([before.error, here.error])
         )
+        objective, after = costs + jax.vmap(state.penalty.energy)(nets)
         gain = objective - after
         feet = (before.u, before.v), (here.u, here.v)
         longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
@@ -260,7 +253,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
             *(net, *feet, damping),
         )
         if guard is None:
-            penalty: Any = WeightedPlate(plate_of(state.plate, surface), state.smoothing)
+            plate = plate_of(state.plate, surface)
+            penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
             size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
             penalty = self.smoothing.penalty(guard, surface, size)
@@ -296,12 +290,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ) -> tuple[Iterate, dict[str, Any]]:
         """The iterate as it is; lambda, the integral (10), the last damping and the rejected steps."""
         state, surface = iterate.state, iterate.surface
-        energy = plate_of(state.plate, surface).energy(surface.control_points)
-        stats = {**({} if state.guard is None else {"guard": state.guard}), 
-            "bending_energy": energy * problem.scale**2,
-            "damping": state.damping.damping,
-            "rejected_steps": state.damping.rejected_steps,
+        stats = {"damping": state.damping.damping, "rejected_steps": state.damping.rejected_steps}
+        if state.guard is not None:
+            return iterate, stats
+        energy = plate_of(state.plate, surface).energy(surface.control_points) * problem.scale**2
+        return iterate, {
+            "smoothing": as_smoothing(self.smoothing, energy.dtype),
+            "bending_energy": energy,
+            **stats,
         }
-        if state.guard is None:
-            return iterate, {"smoothing": state.smoothing / jnp.sum(problem.weight), **stats}
-        return iterate, stats
