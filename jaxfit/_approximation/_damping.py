@@ -24,8 +24,8 @@ LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 class DampingState(eqx.Module):
     """The surface a step began from, and what decides whether it is accepted.
 
-    `predicted` is the predicted reduction of the objective. `damping` lies between its minimum and 1, at which
-    no step can fail.
+    `predicted` is the predicted reduction of the objective. `damping` lies between its minimum and 1, at
+    which no step can fail.
     """
 
     origin: WorkingSurface

@@ -9,8 +9,13 @@ from jaxtyping import Bool, Float
 
 from jaxfit._approximation._damping import within_reach
 from jaxfit._approximation._distance_rows import NormalEquations
-from jaxfit._approximation._smoothing_term import Penalty
-from jaxfit._normal_equations import Stencil, coupled_preconditioner, free_points, solve_coupled
+from jaxfit._normal_equations import (
+    AbstractPenalty,
+    Stencil,
+    coupled_preconditioner,
+    free_points,
+    solve_coupled,
+)
 
 RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
 MOST_STEPS = 60  # of conjugate gradients
@@ -18,7 +23,7 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
 def gauss_newton_step(
-    penalty: Penalty,
+    penalty: AbstractPenalty,
     reach: Any,
     correction_rhs: Callable[[Array, Array], Array],
     equations: NormalEquations,
@@ -31,13 +36,13 @@ def gauss_newton_step(
     `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
     damping 1 there is none.
     """
-    stiffness = penalty.stencil()
+    stiffness, bent = penalty.system(net)
     matrix = equations.matrix.plus(stiffness, 1.0)
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     scale = 1.0 + (net.shape[2] - 1) * damping
     uncoupled = Stencil(equations.matrix.trace.entries / scale).plus(stiffness, 1.0)
     free = free_points(uncoupled, held)
-    right = equations.gradient - penalty.gradient(net, stiffness)
+    right = equations.gradient - bent
     right = jnp.where(free[:, :, None], right, 0.0)
     preconditioner = coupled_preconditioner(matrix, uncoupled, free)
     corrected = damping < 1

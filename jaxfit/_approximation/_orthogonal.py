@@ -24,7 +24,6 @@ from jaxfit._approximation._losses import check_loss, loss_length, reweighted, t
 from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
-    WeightedPlate,
     as_smoothing,
     check_smoothing,
     constant_plate,
@@ -40,7 +39,7 @@ from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import ThinPlate
+from jaxfit._normal_equations import AbstractPenalty, ThinPlate, WeightedPlate
 from jaxfit._splines._pieces import pieces_on
 
 
@@ -52,7 +51,7 @@ class OrthogonalState(eqx.Module):
     """
 
     damping: DampingState
-    penalty: Any
+    penalty: AbstractPenalty
     guard: FoldGuard | None
     smoothing: Float[Any, ""]
     plate: ThinPlate | None
@@ -121,8 +120,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     Notes
     -----
-    The fit's `stats` contain `bending_energy`, the integral (10) in the squared unit of the data; `damping`,
-    the last mu; `rejected_steps`, the number of rejected steps; and of a thin plate `smoothing`, lambda.
+    The fit's `stats` contain `damping`, the last mu, and `rejected_steps`, the number of rejected steps; with
+    a thin plate also `smoothing`, lambda, and `bending_energy`, the integral (10) in the squared unit of the
+    data.
 
     Folds of the base surface may stay, and with a thin plate or without smoothing new ones may form where
     the base is far from the points, the net too coarse, or the points lie in a pocket under the sheet. A
@@ -189,17 +189,14 @@ class OrthogonalDistance(AbstractIterativeMethod):
         self, problem: Problem, surface: WorkingSurface, projection: Projection
     ) -> tuple[WorkingSurface, OrthogonalState]:
         """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
-        plate, dtype = constant_plate(self.insertion, surface), problem.target.dtype
+        dtype = problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
         damping, total = first_damping(surface, dtype), problem.weight.sum()
         if isinstance(self.smoothing, RegularSmoothing):
-            cells = surface.axis_u.cells, surface.axis_v.cells
-            guard = self.smoothing.begin(surface.control_points.shape[:2], cells, dtype)
-            nothing = np.zeros((), dtype)
-            shapes = jax.eval_shape(self.smoothing.penalty, guard, surface, nothing)
-            penalty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)  # of no step yet
-            return surface, OrthogonalState(damping, penalty, guard, nothing, plate)
+            guard, nothing = self.smoothing.begin(surface)
+            return surface, OrthogonalState(damping, nothing, guard, np.zeros((), dtype), None)
         smoothing = as_smoothing(self.smoothing, dtype) * total
+        plate = constant_plate(self.insertion, surface)
         penalty = WeightedPlate(plate_of(plate, surface), smoothing)
         return surface, OrthogonalState(damping, penalty, None, smoothing, plate)
 
@@ -219,9 +216,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
         here, before = new.projection, old.projection
         # Both surfaces are compared with the same scale of the loss.
         length = loss_length(self.loss, problem, before.error)
-        errors = jnp.stack([before.error, here.error])
         nets = jnp.stack([damped.origin.control_points, new.surface.control_points])
-        costs = jax.vmap(partial(total_cost, self.loss, length, problem.weight))(errors)
+        costs = jax.vmap(partial(total_cost, self.loss, length, problem.weight))(
+            jnp.stack([before.error, here.error])
+        )
         objective, after = costs + jax.vmap(state.penalty.energy)(nets)
         gain = objective - after
         feet = (before.u, before.v), (here.u, here.v)
@@ -262,7 +260,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
             *(net, *feet, damping),
         )
         if guard is None:
-            penalty: Any = WeightedPlate(plate_of(state.plate, surface), state.smoothing)
+            plate = plate_of(state.plate, surface)
+            penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
             size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
             penalty = self.smoothing.penalty(guard, surface, size)
@@ -298,13 +297,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
     ) -> tuple[Iterate, dict[str, Any]]:
         """The iterate as it is; lambda, the integral (10), the last damping and the rejected steps."""
         state, surface = iterate.state, iterate.surface
-        energy = plate_of(state.plate, surface).energy(surface.control_points)
-        stats = {
-            **({} if state.guard is None else {"guard": state.guard}),
-            "bending_energy": energy * problem.scale**2,
-            "damping": state.damping.damping,
-            "rejected_steps": state.damping.rejected_steps,
+        stats = {"damping": state.damping.damping, "rejected_steps": state.damping.rejected_steps}
+        if state.guard is not None:
+            return iterate, stats
+        energy = plate_of(state.plate, surface).energy(surface.control_points) * problem.scale**2
+        return iterate, {
+            "smoothing": as_smoothing(self.smoothing, energy.dtype),
+            "bending_energy": energy,
+            **stats,
         }
-        if state.guard is None:
-            return iterate, {"smoothing": state.smoothing / jnp.sum(problem.weight), **stats}
-        return iterate, stats

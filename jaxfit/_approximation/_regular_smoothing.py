@@ -3,6 +3,7 @@ r"""`RegularSmoothing`: follows the errors, and is raised where a step would fol
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -13,7 +14,7 @@ from jaxfit._checks import check_number
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import Roughness
 
-LONGEST_HOLD = 63.0  # accepted steps for which control points stay, around folds that come again and again
+LONGEST_HOLD = 3.0  # accepted steps for which control points stay, around folds that come again and again
 STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
 FLOOR_FALL = 0.95  # at once: it falls by this with every accepted step
@@ -66,7 +67,7 @@ class RegularSmoothing(eqx.Module):
     1.0
     """
 
-    least: float = 8.0
+    least: float = 5.0
     first: float = 100.0
     fall: float = 0.7
     raised: float = 2.0
@@ -78,7 +79,7 @@ class RegularSmoothing(eqx.Module):
         if not 0 < self.least <= self.first <= self.most:
             raise ValueError(
                 "least, first and most must be positive and not decrease, but are "
-                f"{self.least!r}, {self.first!r} and {self.most!r}; the defaults are 8, 100 and 1000."
+                f"{self.least!r}, {self.first!r} and {self.most!r}; the defaults are 5, 100 and 1000."
             )
         if not 0 < self.fall < 1 < self.raised:
             raise ValueError(
@@ -86,15 +87,20 @@ class RegularSmoothing(eqx.Module):
                 f"and {self.raised!r}; the defaults are 0.7 and 2."
             )
 
-    def begin(self, shape: tuple[int, ...], cells: tuple[int, int], dtype: Any) -> "FoldGuard":
-        """Before the first step."""
-        factor, floor, zero = (np.full(shape, x, dtype) for x in (self.first, self.least, 0.0))
-        return FoldGuard(factor, floor, zero, zero, np.zeros(cells, dtype))
+    def begin(self, surface: WorkingSurface) -> tuple["FoldGuard", Roughness]:
+        """Before the first step, and in place of a smoothing term nothing."""
+        net = surface.control_points
+        factor, floor, zero = (np.full(net.shape[:2], x, net.dtype) for x in (self.first, self.least, 0.0))
+        folds = np.zeros((surface.axis_u.cells, surface.axis_v.cells), net.dtype)
+        knots = surface.knots_u, surface.knots_v
+        shapes = jax.eval_shape(lambda: Roughness.of(jnp.asarray(net), *knots, jnp.asarray(factor)))
+        nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+        return FoldGuard(factor, floor, zero, zero, folds), nothing
 
     def penalty(self, guard: "FoldGuard", surface: WorkingSurface, size: Array) -> Roughness:
         """The smoothing term of a step from a surface whose distances have the mean square `size`."""
         knots = surface.knots_u, surface.knots_v
-        return Roughness.of(surface.control_points, *knots, size * guard.factor)
+        return Roughness.of(jnp.asarray(surface.control_points), *knots, size * jnp.asarray(guard.factor))
 
     def after(
         self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any

@@ -1,48 +1,13 @@
-"""The smoothing term of the least-squares fits: a quadratic form, such as lambda times the thin plate."""
+"""The smoothing term of the least-squares fits: the thin plate, and lambda, its weight."""
 
-from typing import Any, Protocol
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import Stencil, ThinPlate, thin_plate
-
-
-class Penalty(Protocol):
-    """A smoothing term of an objective: a positive semidefinite quadratic form on nets."""
-
-    def energy(self, net: Float[Array, "nu nv d"]) -> Float[Array, ""]:
-        """The form at a net."""
-
-    def gradient(self, net: Float[Array, "nu nv d"], stencil: Stencil) -> Float[Array, "nu nv d"]:
-        """Half its gradient: the matrix times a net."""
-
-    def stencil(self) -> Stencil:
-        """Its matrix."""
-
-
-class WeightedPlate(eqx.Module):
-    """lambda times the thin plate."""
-
-    plate: ThinPlate
-    smoothing: Float[Any, ""]
-
-    def energy(self, net: Float[Array, "nu nv d"]) -> Float[Array, ""]:
-        """lambda F_s."""
-        return self.smoothing * self.plate.energy(net)
-
-    def gradient(self, net: Float[Array, "nu nv d"], stencil: Stencil) -> Float[Array, "nu nv d"]:
-        """lambda A P, by way of the second derivatives, which loses no digits."""
-        return self.smoothing * self.plate.adjoint(self.plate.residual(net))
-
-    def stencil(self) -> Stencil:
-        """lambda A."""
-        return Stencil(self.smoothing * self.plate.stencil().entries)
+from jaxfit._normal_equations import ThinPlate, thin_plate
 
 
 def check_smoothing(smoothing: Any) -> None:

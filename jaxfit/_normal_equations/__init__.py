@@ -9,6 +9,8 @@ from jaxfit._normal_equations._curvature_energy import curvature_energy as curva
 from jaxfit._normal_equations._normal_operator import BlockCholesky as BlockCholesky
 from jaxfit._normal_equations._normal_operator import NormalOperator as NormalOperator
 from jaxfit._normal_equations._normal_operator import normal_solver as normal_solver
+from jaxfit._normal_equations._penalty import AbstractPenalty as AbstractPenalty
+from jaxfit._normal_equations._penalty import WeightedPlate as WeightedPlate
 from jaxfit._normal_equations._roughness import Roughness as Roughness
 from jaxfit._normal_equations._stencil import Stencil as Stencil
 from jaxfit._normal_equations._system import RegularisedSystem as RegularisedSystem

@@ -23,6 +23,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._checks import is_concrete
+from jaxfit._normal_equations._penalty import AbstractPenalty
 from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._splines._knots import greville
 from jaxfit._splines._pieces import Numbers
@@ -51,7 +52,7 @@ class NetSquares(eqx.Module):
     vv: Float[Array, "nu nv"]
 
 
-class Roughness(eqx.Module):
+class Roughness(AbstractPenalty):
     """The quadratic form: the sum of `weights` times the squared second differences of a net."""
 
     along_u: _Differences
@@ -83,12 +84,12 @@ class Roughness(eqx.Module):
         )
         return sum((jnp.sum(weight * jnp.sum(x**2, axis=-1)) for weight, x in parts), jnp.zeros(()))
 
-    def gradient(self, net: Float[Array, "nu nv d"], stencil: Stencil) -> Float[Array, "nu nv d"]:
-        """Half its gradient: its matrix, `stencil`, times a net."""
-        return stencil(net)
+    def system(self, net: Float[Array, "nu nv d"]) -> tuple[Stencil, Float[Array, "nu nv d"]]:
+        """Its matrix, and this matrix times a net, half the gradient there."""
+        stencil = self._stencil()
+        return stencil, stencil(net)
 
-    def stencil(self) -> Stencil:
-        """Its matrix."""
+    def _stencil(self) -> Stencil:
         order_u, order_v = self.order
         uu, vv = _bands(self.along_u.second, self.weights.uu), _bands(self.along_v.second, self.weights.vv.T)
         step = jnp.asarray(self.along_u.step)[:, None] * jnp.asarray(self.along_v.step)[None, :]
@@ -112,10 +113,10 @@ def _differences(knots: Any, order: int) -> _Differences:
     # The root of what the difference stands for, so that sums of squares are integrals.
     inside = apart[:-1] & apart[1:] & (order > 2)
     share = xp.sqrt(xp.where(inside, 2.0 * mean / xp.where(inside, gaps[:-1] + gaps[1:], 1.0), 0.0))
-    second = xp.pad(share * xp.stack([before, -before - after, after]), ((0, 0), (1, 1)))
+    second = xp.pad(share[None] * xp.stack([before, -before - after, after]), ((0, 0), (1, 1)))
     left, right = xp.pad(inverse, (1, 0)), xp.pad(inverse, (0, 1))
     sides = xp.maximum((left > 0).astype(places.dtype) + (right > 0), 1.0)
-    first = xp.stack([-left, left - right, right]) / sides
+    first = xp.stack([-left, left - right, right]) / sides[None]
     return _Differences(first, second, xp.sqrt(inverse))
 
 
