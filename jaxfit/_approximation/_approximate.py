@@ -119,14 +119,9 @@ def default_method(method: AbstractIterativeMethod | None) -> AbstractIterativeM
 
 
 def fit_cloud(
-    points: ArrayLike,
-    base: BSplineSurface,
-    method: AbstractIterativeMethod,
-    request: dict[str, Any],
-    least: int = 0,
+    points: ArrayLike, base: BSplineSurface, method: AbstractIterativeMethod, request: dict[str, Any]
 ) -> Fit:
-    """`approximate`, with room for a net of at least `least` control points each way, or for twice that, and
-    so on: nets of different sizes then share a program. Each iteration takes longer for it."""
+    """`approximate`, its options in a dictionary."""
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
@@ -148,7 +143,7 @@ def fit_cloud(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
-    loop = begin(method, together, _with_room(begun, least), u[order], v[order], max_steps)
+    loop = begin(method, together, begun, u[order], v[order], max_steps)
     loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = _fitted(loop, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
@@ -181,14 +176,6 @@ def _working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> Workin
         np.asarray(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (base.knots_u, base.knots_v)
     )
     return WorkingSurface.of(net, knots_u, knots_v)
-
-
-def _with_room(surface: WorkingSurface, least: int) -> WorkingSurface:
-    """With surplus control points up to `least`, or twice, four times, ... as many, each way."""
-    if least == 0:
-        return surface
-    sizes = surface.control_points.shape[:2]
-    return surface.padded(*((least << max(0, -(-n // least) - 1).bit_length()) - n for n in sizes))
 
 
 def _padded(x: Any, size: int, dtype: Any) -> Any:

@@ -23,7 +23,6 @@ HELD_OUT = 10  # one in so many points
 POINTS_A_CONTROL_POINT = 3  # at least; and of a large cloud so many times
 THINNED = 16  # of these, but never fewer than
 ENOUGH = 20_000  # points are used to choose a net
-ROOM = 32  # nets of up to so many control points share a program, then of up to twice as many, and so on
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
@@ -86,7 +85,7 @@ class NetGrowth:
             "throw": False,
             "errors": LocalFeet(),
         }
-        fit = fit_cloud(self.points[some], base, self.method, request, ROOM)
+        fit = fit_cloud(self.points[some], base, self.method, request)
         return Level(size, fit, float(np.asarray(fit.errors)[held_out & (weights > 0)].mean()))
 
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
@@ -114,12 +113,12 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     size, request = level.size, growth.request | {"throw": False, "start": None}
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
-    fit = fit_cloud(growth.points, level.fit.surface, growth.method, request, ROOM)
+    fit = fit_cloud(growth.points, level.fit.surface, growth.method, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= LEAST_GROWTH
         if bool(fit.converged) or size > growth.most:
             break
-        fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request, ROOM)
+        fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request)
     if not bool(fit.converged) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit

@@ -141,7 +141,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     --------
     >>> method = jf.OrthogonalDistance(loss=jf.Huber(), border=jf.FixedCorners())
     >>> method.smoothing.least, method.damping, method.reach
-    (8.0, 0.01, 0.6)
+    (5.0, 0.01, 0.6)
     >>> jf.OrthogonalDistance(damping=2.0)
     Traceback (most recent call last):
     ...

@@ -5,7 +5,6 @@ from jaxtyping import Float
 
 from jaxfit._base._base_surface import base_surface
 from jaxfit._base._boundary import Boundary
-from jaxfit._base._coons import GREVILLE, coons_net
 from jaxfit._base._host_splines import GridEvaluator, Knots
 from jaxfit._splines import BSplineSurface, greville_abscissae
 
@@ -13,21 +12,16 @@ from jaxfit._splines import BSplineSurface, greville_abscissae
 def carried_base(
     surface: BSplineSurface, boundary: Boundary, net: tuple[int, int], order: tuple[int, int]
 ) -> BSplineSurface:
-    """`surface` on the knots that the boundary curves have with `net`, its sides moved onto these curves.
+    """`surface` on the knots that the boundary curves have with `net`, with these curves as its sides.
 
-    It is interpolated at the Greville abscissae. What the sides lack to the boundary curves is blended over
-    the inside as in (6)-(7), so that nearly the same surface with exact sides comes out.
+    It is interpolated at the Greville abscissae; then the control points on the border are replaced. Those
+    inside stay, for a coarse net may have missed the curves by much more than it missed the points.
     """
     sides = base_surface(boundary, net=net, order=order)
     knots = (np.asarray(sides.knots_u, float), np.asarray(sides.knots_v, float))
-    inside = _interpolated(surface, knots, order)
-    lacking = np.asarray(sides.control_points, float) - inside
-    edges = lacking[:, 0], lacking[:, -1], lacking[0], lacking[-1]
-    moved = inside + np.asarray(coons_net(edges, *knots, GREVILLE), float)
-    for edge in ((0,), (-1,), (slice(None), 0), (slice(None), -1)):
-        moved[edge] = np.asarray(sides.control_points)[edge]
-    dtype = np.asarray(sides.control_points).dtype
-    return BSplineSurface(moved.astype(dtype), sides.knots_u, sides.knots_v)
+    carried = np.array(sides.control_points)
+    carried[1:-1, 1:-1] = _interpolated(surface, knots, order)[1:-1, 1:-1]
+    return BSplineSurface(carried, sides.knots_u, sides.knots_v)
 
 
 def _interpolated(

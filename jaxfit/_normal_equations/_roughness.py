@@ -106,7 +106,8 @@ def _differences(knots: Any, order: int) -> _Differences:
     """For the Greville abscissae of these knots; surplus control points have no differences."""
     places = greville(knots, order)
     xp: Any = np if is_concrete(knots) else jnp
-    gaps, mean = places[1:] - places[:-1], (places[-1] - places[0]) / (places.shape[0] - 1)
+    gaps = places[1:] - places[:-1]
+    mean = (places[-1] - places[0]) / xp.maximum(xp.sum(gaps > 0), 1)  # of those that are not surplus
     apart = gaps > LEAST_GAP * mean
     inverse = xp.where(apart, mean / xp.where(apart, gaps, 1.0), 0.0)
     before, after = inverse[:-1], inverse[1:]
