@@ -11,6 +11,8 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._approximation._damping import (
+    GUARDED_DAMPING,
+    USUAL_DAMPING,
     DampingState,
     farthest_move,
     first_damping,
@@ -157,7 +159,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     foot_method: AbstractFootMethod = Newton()
     foot_tolerance: float = 1e-12
     stall_window: int = 20
-    stall_gain: float = 2e-3
+    stall_gain: float = 1e-2
 
     def __check_init__(self) -> None:
         if not isinstance(self.smoothing, RegularSmoothing):
@@ -232,7 +234,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
             guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order)
         # A step that folds is taken again with more smoothing there, not with more damping everywhere.
-        following = jnp.where(better & ~good, damped.damping, next_damping(damped, objective, gain, better))
+        usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
+        following = next_damping(damped, objective, gain, better, usual)
+        following = jnp.where(better & ~good, damped.damping, following)
         following = jnp.where(new.step == 1, self.damping, following)
         kept = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
         surface, projection = kept
@@ -264,7 +268,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
             size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
-            penalty = self.smoothing.penalty(guard, surface, size)
+            penalty = self.smoothing.penalty(guard, surface, size, problem.diagonal)
 
         def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
@@ -299,7 +303,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         state, surface = iterate.state, iterate.surface
         stats = {"damping": state.damping.damping, "rejected_steps": state.damping.rejected_steps}
         if state.guard is not None:
-            return iterate, stats
+            away = self.smoothing.held_back(state.guard, surface, problem, iterate.projection)
+            return iterate, {"points_out_of_reach": jnp.sum(away, dtype=jnp.int32), **stats}
         energy = plate_of(state.plate, surface).energy(surface.control_points) * problem.scale**2
         return iterate, {
             "smoothing": as_smoothing(self.smoothing, energy.dtype),

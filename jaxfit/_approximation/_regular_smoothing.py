@@ -7,14 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxfit._approximation._folds import folds_by_cell, near_folds
 from jaxfit._checks import check_number
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import Roughness
 
+# Below this share of the diagonal, distances are met with less smoothing yet, or else where a surface can
+# be met exactly the last digits would come slowly.
+FINE = 3e-5
 LONGEST_HOLD = 3.0  # accepted steps for which control points stay, around folds that come again and again
+FAR = 4.0  # times the average error, where folds have been kept out: out of reach
 STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
 FLOOR_FALL = 0.95  # at once: it falls by this with every accepted step
@@ -97,10 +103,11 @@ class RegularSmoothing(eqx.Module):
         nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         return FoldGuard(factor, floor, zero, zero, folds), nothing
 
-    def penalty(self, guard: "FoldGuard", surface: WorkingSurface, size: Array) -> Roughness:
+    def penalty(self, guard: "FoldGuard", surface: WorkingSurface, size: Array, diagonal: Array) -> Roughness:
         """The smoothing term of a step from a surface whose distances have the mean square `size`."""
-        knots = surface.knots_u, surface.knots_v
-        return Roughness.of(jnp.asarray(surface.control_points), *knots, size * jnp.asarray(guard.factor))
+        knots, net = (surface.knots_u, surface.knots_v), jnp.asarray(surface.control_points)
+        weight = size * jnp.minimum(jnp.sqrt(size) / (FINE * diagonal), 1.0)
+        return Roughness.of(net, *knots, weight * jnp.asarray(guard.factor))
 
     def after(
         self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any
@@ -122,6 +129,18 @@ class RegularSmoothing(eqx.Module):
         """For a surface whose new knots have moved the control points in the net."""
         least = jnp.full_like(guard.factor, self.least)
         return FoldGuard(least, least, *(jnp.zeros_like(least),) * 2, guard.folds).seeing(surface)
+
+    def held_back(
+        self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, here: Projection
+    ) -> Bool[Array, " points"]:
+        """Points far from the surface where it has been kept from folding."""
+        i, j = (
+            axis.locate(x) + axis.polynomials.shape[1] // 2
+            for axis, x in zip(jax.tree.map(jnp.asarray, surface.axes), (here.u, here.v), strict=True)
+        )
+        average = jnp.sum(jnp.where(problem.counted, here.error, 0.0)) / jnp.sum(problem.counted)
+        stiff = jnp.asarray(guard.floor)[i, j] > self.least
+        return problem.counted & stiff & (here.error > FAR * average)
 
 
 class FoldGuard(eqx.Module):
