@@ -48,6 +48,10 @@ def _run(argv: Sequence[str] | None) -> int:
         args = argument_parser().parse_args(argv)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
+            if args.command == "batch":
+                from jaxfit._cli_batch import batch_command
+
+                return batch_command(args)
             return _fit_command(args, started)
     except KeyboardInterrupt:
         return _fail("interrupted, nothing more is written.", INTERRUPTED)

@@ -28,7 +28,9 @@ ROOMS = [
     ("io",),
     ("plot",),
     ("_cli_arguments", "_cli_cache", "_cli_report"),
-    ("_cli_session", "_cli_fit"),
+    ("_cli_session", "_cli_fit", "_cli_table", "_cli_workers"),
+    ("_cli_batch_file",),
+    ("_cli_batch",),
     ("_cli",),
     ("__main__",),
 ]
