@@ -4,14 +4,11 @@ All three take jobs as executors of `concurrent.futures` do; what differs is how
 """
 
 import contextlib
-import gc
-import multiprocessing
-import os
-import signal
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from typing import Any, TypeVar
 
+from jaxfit._batch._worker_processes import end_processes, started_processes
 from jaxfit.io import InputError
 
 Done = TypeVar("Done")
@@ -45,16 +42,7 @@ class Processes:
 
     def __init__(self, workers: int):
         self.width = workers
-        # JAX reads it as it starts: each process computes with its share of the cores.
-        os.environ.setdefault("NPROC", str(max(1, (os.cpu_count() or 1) // workers)))
-        self._start()
-
-    def _start(self) -> None:
-        from concurrent.futures import ProcessPoolExecutor
-
-        # A fork would inherit the threads of JAX without what they hold.
-        spawn = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(self.width, mp_context=spawn, initializer=_ignore_interrupts)
+        self._pool = started_processes(workers)
 
     def submit(self, function: Callable[..., Any], *args: Any) -> Future:
         """Hand it to a free process."""
@@ -62,17 +50,12 @@ class Processes:
 
     def restart(self) -> None:
         """New processes in place of those that ended."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        self._start()
+        self.shutdown(at_once=True)
+        self._pool = started_processes(self.width)
 
     def shutdown(self, at_once: bool = False) -> None:
         """End the processes, `at_once` also those that are in the middle of a fit."""
-        self._pool.shutdown(wait=not at_once, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-            process.join()
-        del self._pool
-        gc.collect()  # with its semaphores, of which the system otherwise warns
+        end_processes(self._pool, at_once)
 
 
 class Cluster:
@@ -121,12 +104,6 @@ def chosen_pool(workers: int, scheduler: str | None) -> Iterator[Any]:
         pool.shutdown(at_once=True)
         raise
     pool.shutdown()
-
-
-def _ignore_interrupts() -> None:
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches all processes; the first one ends the others
 
 
 class Schedule:

@@ -25,6 +25,7 @@ ROOMS = [
     ("_fit",),
     ("_interpolation",),
     ("_approximation",),
+    ("_batch",),
     ("io",),
     ("plot",),
     ("_cli_arguments", "_cli_cache", "_cli_report"),
