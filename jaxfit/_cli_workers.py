@@ -171,6 +171,8 @@ class Schedule:
 def _result(future: Future, job: Any, died: Callable[[Any], Done]) -> Done:
     try:
         return future.result()
+    except BrokenExecutor:
+        raise
     except CancelledError as error:
         raise OSError(
             "the connection to the Dask scheduler was lost; run the command again, finished files are kept."

@@ -71,7 +71,8 @@ def started_processes(workers: int) -> ProcessPoolExecutor:
         # A fork would inherit the threads of JAX without what they hold.
         spawn = multiprocessing.get_context("spawn")
         pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_ignore_interrupts)
-        pool.submit(working_dtype)  # starts all of them
+        for _ in range(workers):
+            pool.submit(working_dtype)  # each starts a process, for none is idle yet
     finally:
         for name, value in before.items():
             if value is None:
