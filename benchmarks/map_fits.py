@@ -4,8 +4,9 @@
 
 All fits take 20 steps from one base surface. The ways take turns. Printed are the first call, which compiles
 (or starts the processes), fits a second in a later one (the best run: others may use the machine), that as a
-multiple of a Python loop over the jitted fit, processor milliseconds a fit, and the largest difference of a
-control point from the loop over `approximate`, as a fraction of the diagonal.
+multiple of a Python loop over the jitted fit, processor milliseconds a fit (of this process, not of the
+workers), and the largest difference of a control point from the loop over `approximate`, as a fraction of
+the diagonal.
 """
 
 import argparse
@@ -79,7 +80,7 @@ def ways(method, clouds, base, executor):
 
 
 def timed(work):
-    """Seconds, processor seconds of this process and its finished children, and the result."""
+    """Seconds, processor seconds of this process, and the result."""
     begun, used = time.perf_counter(), time.process_time()
     result = work()
     return time.perf_counter() - begun, time.process_time() - used, result
