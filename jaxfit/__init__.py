@@ -34,6 +34,10 @@ from jaxfit._base import Uniform as Uniform
 from jaxfit._base import base_surface as base_surface
 from jaxfit._base import coons_surface as coons_surface
 from jaxfit._base import meshless_parameters as meshless_parameters
+from jaxfit._batch import PaddedClouds as PaddedClouds
+from jaxfit._batch import map_fits as map_fits
+from jaxfit._batch import pad_clouds as pad_clouds
+from jaxfit._batch import worker_processes as worker_processes
 from jaxfit._closest import ClosestPoint as ClosestPoint
 from jaxfit._closest import HuWallner as HuWallner
 from jaxfit._closest import Newton as Newton

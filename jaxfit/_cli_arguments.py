@@ -3,7 +3,7 @@
 import argparse
 import math
 import re
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from jaxfit import __version__
 from jaxfit.io import InputError
@@ -36,6 +36,21 @@ environment:
 All errors are distances from the data to the surface, in % of the diagonal of the data's
 bounding box.
 """
+_BATCH_DESCRIPTION = """\
+Fit a B-spline surface to each FILE. FOLDER then holds NAME.npz for each NAME.*, and a row for each
+file in table.csv and table.jsonl: errors, net, folds, or the sentence of what was wrong. A file that
+cannot be fitted is passed over. Files whose row is there, made with the same options from the same
+file, are not fitted again, so a run that was interrupted goes on where it stopped.
+"""
+_BATCH_EPILOG = """\
+exit codes:
+  0  all files fitted
+  1  all fitted, but the requested tolerance was not reached in some
+  2  bad usage, or the folder cannot be written
+  3  some files failed: their rows and stderr say why
+
+With --scheduler the workers read FILES and write FOLDER under the same paths, and have jaxfit.
+"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -48,6 +63,12 @@ def argument_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxfit", description="B-spline surfaces through points, in JAX.")
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    _add_fit(commands)
+    _add_batch(commands)
+    return parser
+
+
+def _add_fit(commands: Any) -> None:
     fit = commands.add_parser(
         "fit",
         help="fit a surface to a file of points",
@@ -57,36 +78,63 @@ def argument_parser() -> argparse.ArgumentParser:
     )
     fit.add_argument("input", metavar="INPUT", help="the points, see above")
     fit.add_argument("-o", "--output", metavar="OUTPUT", required=True, help="the surface")
-    fit.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
-    fit.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
-    fit.add_argument(
+    _add_fit_options(fit)
+    picture = fit.add_mutually_exclusive_group()
+    picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
+    picture.add_argument("--no-picture", action="store_true", help="draw nothing")
+    fit.set_defaults(command="fit")
+
+
+def _add_batch(commands: Any) -> None:
+    batch = commands.add_parser(
+        "batch",
+        help="fit a surface to each of many files",
+        description=_BATCH_DESCRIPTION,
+        epilog=_BATCH_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    batch.add_argument("inputs", metavar="FILE", nargs="+", help="points, as for jaxfit fit")
+    batch.add_argument("-o", "--output", metavar="FOLDER", required=True, help="surfaces and table; is made")
+    where = batch.add_mutually_exclusive_group()
+    where.add_argument(
+        "--workers", type=_workers, metavar="N", default=1, help="processes of this machine (default 1)"
+    )
+    where.add_argument("--scheduler", metavar="ADDRESS", help="fit on the workers of this Dask scheduler")
+    batch.add_argument("--retry-failed", action="store_true", help="fit again what failed in an earlier run")
+    _add_fit_options(batch)
+    batch.set_defaults(command="batch")
+
+
+def _add_fit_options(parser: argparse.ArgumentParser) -> None:
+    """What a single fit and each of many can be told."""
+    parser.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
+    parser.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
+    parser.add_argument(
         "--method",
         choices=("auto", "interpolate", "approximate"),
         default="auto",
         help="auto interpolates grids of up to 40,000 points unless --net is given, and "
         "approximates everything else",
     )
-    fit.add_argument("--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row")
-    fit.add_argument("--boundary", metavar="FILE", help=".npz with the four border polylines")
+    parser.add_argument(
+        "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
+    )
+    parser.add_argument("--boundary", metavar="FILE", help=".npz with the four border polylines")
     for which in ("average", "maximum"):
-        fit.add_argument(
+        parser.add_argument(
             f"--tol-{which}",
             type=_percent,
             metavar="PCT",
             help=f"stop at this {which} error, in %%",
         )
-    fit.add_argument("--max-steps", type=_count, metavar="N", help="stop after this many steps")
-    picture = fit.add_mutually_exclusive_group()
-    picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
-    picture.add_argument("--no-picture", action="store_true", help="draw nothing")
-    cache = fit.add_mutually_exclusive_group()
+    parser.add_argument("--max-steps", type=_count, metavar="N", help="stop after this many steps")
+    cache = parser.add_mutually_exclusive_group()
     cache.add_argument(
         "--cache", metavar="DIR", help="keep compiled programs there (default: the user's cache folder)"
     )
     cache.add_argument("--no-cache", action="store_true", help="keep no compiled programs")
-    fit.add_argument("--float32", action="store_true", help="single precision")
-    fit.add_argument("--quiet", action="store_true", help="print nothing but errors")
-    return parser
+    parser.add_argument("--float32", action="store_true", help="single precision")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
 
 
 def _pair(text: str) -> tuple[int, int]:
@@ -104,6 +152,12 @@ def _percent(text: str) -> float:
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no percentage such as 0.02")
     return value
+
+
+def _workers(text: str) -> int:
+    if not re.fullmatch(r"[1-9]\d{0,2}", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of processes such as 2")
+    return int(text)
 
 
 def _count(text: str) -> int:

@@ -84,6 +84,8 @@ class FootLimits(eqx.Module):
         """With no tolerance below the rounding of a residual; no coordinate is larger than `reach`."""
         noise = 4.0 * jnp.finfo(reach.dtype).eps * reach
         tolerance = jnp.maximum(jnp.asarray(tolerance, reach.dtype), 4.0 * noise)
+        # Of points that are not finite it is a number, too: the steps are counted where it is below infinity.
+        tolerance = jnp.where(jnp.isnan(tolerance), 0.0, tolerance)
         return FootLimits(tolerance, noise, jnp.asarray(steps, reach.dtype))
 
     def rounding_of(self, f: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

@@ -1,0 +1,177 @@
+"""`map_fits`: `approximate` for many clouds, base surfaces or methods."""
+
+import inspect
+from collections.abc import Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxfit._approximation import approximate
+from jaxfit._approximation._approximate import LEAST_POINTS
+from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._batch._broadcast import Request, one_by_one, requests_of
+from jaxfit._batch._failed_fit import failed_fit
+from jaxfit._batch._worker_processes import cores
+from jaxfit._checks import as_points, is_concrete
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._precision import bucket, working_dtype
+from jaxfit._splines import BSplineSurface
+
+_LARGEST_GROUP = 16  # fits that go to a worker at once
+
+
+def map_fits(
+    clouds: ArrayLike | Sequence[ArrayLike],
+    base: BSplineSurface | Sequence[BSplineSurface],
+    method: AbstractIterativeMethod | Sequence[AbstractIterativeMethod] | None = None,
+    weights: ArrayLike | Sequence[ArrayLike] | None = None,
+    executor: Executor | None = None,
+    throw: bool = False,
+    **options: Any,
+) -> tuple[Fit, ...]:
+    """The fits of many clouds, from many base surfaces or by many methods, side by side.
+
+    Fit i is `approximate(clouds[i], base[i], method[i], weights=weights[i], **options)`. What is given once
+    is shared by all. A cloud that is not finite fails alone: its fit has not converged, and its surface is
+    the base. The other fits are the same to the bit.
+
+    Parameters
+    ----------
+    clouds : list of arrays (points, d), array (fits, points, d), or one array (points, d)
+        They may differ in size.
+    base : BSplineSurface, or a list of them
+    method : a method of `approximate`, or a list of them, optional
+        So are lambdas given: ``[jf.StandardApproximation(smoothing=x) for x in lambdas]``.
+    weights : list of arrays (points,), array (fits, points), or one array (points,), optional
+    executor : concurrent.futures.Executor, optional
+        Who computes. Default: threads of this process, one for each core. `worker_processes(2)` has processes
+        that hundreds of fits pay for; that of a Dask client has machines.
+    throw : bool
+        Raise a RuntimeError for the first fit that has not converged, once all are done.
+    options
+        As for `approximate`: tol_average, tol_maximum, max_steps, errors. The same for all.
+
+    Returns
+    -------
+    tuple of Fit
+
+    Raises
+    ------
+    ValueError, TypeError
+        Before anything is computed, as `approximate` does, with the number of the cloud; if the lists differ
+        in length, or nothing is a list.
+
+    Notes
+    -----
+    On a CPU a fit is a loop of small steps that a second core hardly helps, and much of a short fit is
+    Python, of which one thread runs at a time. So threads gain most where fits are long, and processes
+    always. The fits of one program (`jax.lax.map`, or `jax.vmap`, which runs one after the other on a CPU)
+    cannot use a second core, and compile for longer. Inside `jit`, `vmap` or `grad` this is `jax.lax.map`,
+    clouds must have one size (`pad_clouds`), and `executor` is not used.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
+    >>> grid = np.stack([x, y, x * y], axis=2)
+    >>> base = jf.base_surface(jf.Boundary.from_grid(grid), net=(6, 5))
+    >>> cloud = grid.reshape(-1, 3) + 0.2 * np.sin(3 * x * y).reshape(-1, 1)
+    >>> fits = jf.map_fits([cloud, cloud[::2], np.nan * cloud], base, max_steps=3)
+    >>> [len(fit.u) for fit in fits], bool(fits[2].converged)
+    ([60, 30, 60], False)
+    """
+    requests = requests_of(clouds, base, method, weights)
+    _check_names(options)
+    if not is_concrete(requests, options):
+        traced = one_by_one(lambda request: _fit(request, options), requests)
+        return _raised(traced) if throw else tuple(traced)
+    for i, request in enumerate(requests):
+        _check(i, request, options)
+    finite = [i for i, x in enumerate(requests) if _is_finite(x)]
+    done = dict(zip(finite, _run([requests[i] for i in finite], executor, options), strict=True))
+    fits = tuple(
+        done[i] if i in done else failed_fit(x.cloud, x.base, x.method) for i, x in enumerate(requests)
+    )
+    return _raised(fits) if throw else fits
+
+
+def _fit(request: Request, options: dict[str, Any]) -> Fit:
+    return approximate(request.cloud, request.base, request.method, weights=request.weights, **options)
+
+
+def _fit_group(requests: list[Request], options: dict[str, Any]) -> list[Fit]:
+    """What a worker does. The fits are computed when it returns."""
+    return jax.block_until_ready([_fit(request, options) for request in requests])
+
+
+def _run(requests: list[Request], executor: Executor | None, options: dict[str, Any]) -> list[Fit]:
+    if executor is not None:
+        _check_precision(executor)
+        size = min(_LARGEST_GROUP, max(1, len(requests) // _LARGEST_GROUP))
+        return _in_groups(requests, executor, options, size)
+    threads = cores() if jax.default_backend() == "cpu" else 1
+    # The first fit of each size alone: threads that come upon a new program each compile it.
+    sizes = [(bucket(len(x.cloud)), x.base.shape, type(x.method)) for x in requests]
+    leading = [sizes.index(size) == i for i, size in enumerate(sizes)]
+    first = iter(_fit_group([x for x, leads in zip(requests, leading, strict=True) if leads], options))
+    others = [x for x, leads in zip(requests, leading, strict=True) if not leads]
+    with ThreadPoolExecutor(threads) as pool:
+        same = pool.submit(working_dtype).result() == working_dtype()  # which may be switched for one thread
+        rest = iter(_in_groups(others, pool, options, 1) if same else _fit_group(others, options))
+    return [next(first if leads else rest) for leads in leading]
+
+
+def _in_groups(requests: list[Request], executor: Executor, options: dict[str, Any], size: int) -> list[Fit]:
+    groups = [requests[i : i + size] for i in range(0, len(requests), size)]
+    futures = [executor.submit(_fit_group, group, options) for group in groups]
+    try:
+        return [fit for future in futures for fit in future.result()]
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _check_precision(executor: Executor) -> None:
+    there = executor.submit(working_dtype).result()
+    if there != working_dtype():
+        raise ValueError(
+            f"executor must compute in {working_dtype()} like this session, but has {there}; set "
+            "JAX_ENABLE_X64 in the environment of its processes, or use worker_processes."
+        )
+
+
+def _raised(fits: Sequence[Fit]) -> tuple[Fit, ...]:
+    return tuple(converged_or_raise(fit) for fit in fits)
+
+
+def _check(index: int, request: Request, options: dict[str, Any]) -> None:
+    """Raise the sentence of `approximate`, with the number of the cloud, for anything but a NaN in it."""
+    try:
+        numbers = request.cloud if _is_finite(request) else np.nan_to_num(request.cloud)
+        cloud = as_points("points", numbers, request.base.dimension, least=LEAST_POINTS)
+        checked_options = {name: x for name, x in options.items() if name in _CHECKED}
+        if _is_finite(request):
+            checked_request(cloud, request.base.domain, weights=request.weights, **checked_options)
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"clouds[{index}]: {error}") from error
+
+
+def _is_finite(request: Request) -> bool:
+    return bool(np.isfinite(np.asarray(request.cloud)).all())
+
+
+def _check_names(options: dict[str, Any]) -> None:
+    for name in options:
+        if name not in _OPTIONS:
+            raise TypeError(f"{name} is not an option of map_fits; pass any of {', '.join(_OPTIONS)}.")
+
+
+_CHECKED = ("tol_average", "tol_maximum", "max_steps", "errors")
+_OPTIONS = [
+    name
+    for name in inspect.signature(approximate).parameters
+    if name not in ("points", "base", "method", "weights", "start", "progress", "throw")
+]

@@ -1,0 +1,96 @@
+"""`worker_processes`: processes that fit side by side."""
+
+import contextlib
+import gc
+import multiprocessing
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+
+import jax
+
+from jaxfit._precision import working_dtype
+
+_HANDED_ON = (
+    "jax_enable_x64 jax_compilation_cache_dir jax_persistent_cache_min_compile_time_secs "
+    "jax_persistent_cache_min_entry_size_bytes"
+).split()
+
+
+@contextlib.contextmanager
+def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor]:
+    """Processes that share the cores of this machine, as an executor for `map_fits`.
+
+    Each starts Python and JAX anew, which takes seconds, and compiles for itself, or reads what is kept in
+    the compilation cache of the session. So they pay for hundreds of fits, and for further calls with the
+    same executor. They have the precision and the compilation cache of the session, and as many threads as
+    there are cores for each.
+
+    Parameters
+    ----------
+    workers : int, optional
+        How many (default: one for each core).
+
+    Notes
+    -----
+    As always with processes that are not forks, a script has to start its work below
+    ``if __name__ == "__main__":``.
+
+    Examples
+    --------
+    >>> with jf.worker_processes(2) as executor:  # doctest: +SKIP
+    ...     fits = jf.map_fits(clouds, base, executor=executor)
+    >>> callable(jf.worker_processes)
+    True
+    """
+    pool = started_processes(cores() if workers is None else workers)
+    try:
+        yield pool
+    except BaseException:
+        end_processes(pool, at_once=True)
+        raise
+    end_processes(pool)
+
+
+def cores() -> int:
+    """How many this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def started_processes(workers: int) -> ProcessPoolExecutor:
+    """Processes with the settings of the session."""
+    settings = {name.upper(): getattr(jax.config, name, None) for name in _HANDED_ON}
+    ours = {name: str(x) for name, x in settings.items() if x is not None}
+    # JAX reads all of this as it starts.
+    ours["NPROC"] = str(max(1, cores() // workers))
+    before = {name: os.environ.get(name) for name in ours}
+    os.environ.update(ours)
+    try:
+        # A fork would inherit the threads of JAX without what they hold.
+        spawn = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_ignore_interrupts)
+        for _ in range(workers):
+            pool.submit(working_dtype)  # each starts a process, for none is idle yet
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+    return pool
+
+
+def end_processes(pool: ProcessPoolExecutor, at_once: bool = False) -> None:
+    """End them, `at_once` also in the middle of a fit."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=not at_once, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+        process.join()
+    gc.collect()  # of the semaphores, of which the system otherwise warns
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first ends the others

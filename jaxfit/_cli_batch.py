@@ -1,0 +1,84 @@
+"""`jaxfit batch`: many files, one table."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from jaxfit import io
+from jaxfit._cli_batch_file import Job, failed, fit_file, job_of, size_of
+from jaxfit._cli_table import FAILED, FITTED, MISSED, Row, Table
+from jaxfit._cli_workers import Schedule, chosen_pool
+
+_CODES = {FITTED: 0, MISSED: 1, FAILED: 3}
+
+
+def batch_command(args: argparse.Namespace) -> int:
+    """Fit the files that are not yet in the table; return the exit code."""
+    folder = Path(args.output)
+    jobs = _jobs(args, folder)
+    table = Table(folder)
+    left = [job for job in jobs if not table.is_done(job.row, args.retry_failed)]
+    if left:
+        _fit_all(args, left, table)
+        table.sort(job.row["input"] for job in jobs)
+        table.write()
+    rows = [table.rows[job.row["input"]] for job in jobs]
+    if not args.quiet:
+        _summarise(rows, len(jobs) - len(left), table)
+    return max(_CODES[row["status"]] for row in rows)
+
+
+def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
+    """A job for each file; refuses two that would write the same surface, before anything is done."""
+    jobs = {job.row["input"]: job for job in (job_of(args, name) for name in args.inputs)}
+    taken: dict[str, str] = {}
+    for name, job in jobs.items():
+        other = taken.setdefault(job.row["surface"], name)
+        if other != name:
+            raise io.InputError(
+                f"{other} and {name} would both write {job.row['surface']}; rename one, or give them folders "
+                "of their own."
+            )
+        if job.arguments["output"] in (name, job.arguments["boundary"]):
+            raise io.InputError(f"{folder} holds the file {name} that is read; name another folder.")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise io.InputError(f"the folder {folder} cannot be made: {error.strerror or error}.") from error
+    io.check_output(folder / "table.npz")  # whether anything can be written there
+    return list(jobs.values())
+
+
+def _fit_all(args: argparse.Namespace, jobs: list[Job], table: Table) -> None:
+    try:
+        with chosen_pool(args.workers, args.scheduler) as pool:
+            done = Schedule(pool, jobs, size_of).run(fit_file, _died, table.write_if_rested)
+            for count, row in enumerate(done, 1):
+                table.put(row)
+                _report(row, f"{count}/{len(jobs)}", args.quiet)
+    finally:
+        table.write()
+
+
+def _died(job: Job) -> Row:
+    return failed(
+        job, "the process that fitted it was ended, perhaps for want of memory; give it more, or a net."
+    )
+
+
+def _report(row: Row, count: str, quiet: bool) -> None:
+    if row["status"] == FAILED:
+        print(f"jaxfit: error: {_with_name(row)}", file=sys.stderr, flush=True)
+    elif not quiet:
+        errors = (f"{which} {row[f'{which}_error_percent']:.4g} %" for which in ("average", "maximum"))
+        print(f"{count}  {row['input']}  {', '.join(errors)}", flush=True)
+
+
+def _with_name(row: Row) -> str:
+    return row["error"] if row["input"] in row["error"] else f"{row['input']}: {row['error']}"
+
+
+def _summarise(rows: list[Row], before: int, table: Table) -> None:
+    counts = [(name, sum(row["status"] == name for row in rows)) for name in _CODES]
+    said = ", ".join(f"{count} {name}" for name, count in counts if count)
+    print(f"{len(rows)} files ({before} done before): {said}; see {table.sheet}")

@@ -1,0 +1,117 @@
+"""The fit of one file, as the arguments of the command ask for it."""
+
+import argparse
+import math
+import time
+from typing import Any, NamedTuple
+
+import jaxfit
+from jaxfit import io
+from jaxfit._checks import check_magnitude
+
+TERRAIN = "jacksboro"
+_TERRAIN_NET = (62, 57)
+_LARGEST_INTERPOLATION = 40_000  # grid points, for --method auto
+
+
+class FittedFile(NamedTuple):
+    """A fit whose errors are finite, its errors as fractions of the diagonal, and whether these will do."""
+
+    fit: Any
+    method: str
+    average: float
+    maximum: float
+    seconds: float
+    reached: bool
+
+
+def read(args: argparse.Namespace) -> io.PointData:
+    """The points of ``args.input``; of the terrain also its own method and net, in `args`."""
+    if args.input == TERRAIN:
+        data = io.jacksboro()
+        if args.method == "auto":
+            args.method = "approximate"
+        if args.method == "approximate" and args.net is None:
+            args.net = _TERRAIN_NET
+    else:
+        data = io.read_points(args.input)
+        check_magnitude("points", data.cloud)
+    return data if args.grid is None else data.as_grid(*args.grid)
+
+
+class FitOfFile:
+    """What is to be done with the points of a file; raises `InputError` if `args` cannot be met."""
+
+    def __init__(self, args: argparse.Namespace, data: io.PointData):
+        self.args, self.data = args, data
+        self.method = _choose_method(args, data)
+        self.boundary = _choose_boundary(args, data) if self.method == "approximate" else None
+
+    def run(self, progress: Any = None) -> FittedFile:
+        """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""
+        before = time.perf_counter()
+        fit = _fit(self.args, self.method, self.data, self.boundary, progress)
+        average, maximum = float(fit.average_error), float(fit.maximum_error)
+        seconds = time.perf_counter() - before
+        if not (math.isfinite(average) and math.isfinite(maximum)):
+            raise ArithmeticError(fit.message)
+        reached = _reached(self.args, self.method, fit, average, maximum)
+        return FittedFile(fit, self.method, average, maximum, seconds, reached)
+
+
+def _choose_method(args: argparse.Namespace, data: io.PointData) -> str:
+    if args.method == "interpolate":
+        if data.grid is None:
+            raise io.InputError(
+                f"{args.input} holds scattered points, which cannot be interpolated; use "
+                "--method approximate, or --grid NxM if the points make a grid."
+            )
+        if args.net is not None:
+            raise io.InputError(
+                "the net of an interpolating surface is that of the data; leave out --net, or use "
+                "--method approximate."
+            )
+    if args.method != "auto":
+        return args.method
+    small_grid = data.grid is not None and len(data.cloud) <= _LARGEST_INTERPOLATION
+    return "interpolate" if small_grid and args.net is None else "approximate"
+
+
+def _choose_boundary(args: argparse.Namespace, data: io.PointData) -> Any:
+    if args.boundary is not None:
+        return io.read_boundary(args.boundary)
+    if data.boundary is not None:
+        return data.boundary
+    if data.grid is not None:
+        return jaxfit.Boundary.from_grid(data.grid)  # says what is wrong with its edges
+    raise io.InputError(
+        f"{args.input} holds scattered points without a boundary; give the four border polylines "
+        "with --boundary FILE.npz, or --grid NxM if the points make a grid."
+    )
+
+
+def _fit(args: argparse.Namespace, method: str, data: io.PointData, boundary: Any, progress: Any) -> Any:
+    options: dict[str, Any] = {"order": args.order, "progress": progress}
+    if args.max_steps is not None:
+        options["max_steps"] = args.max_steps
+    tolerances = {
+        name: value / 100
+        for name, value in (("tol_average", args.tol_average), ("tol_maximum", args.tol_maximum))
+        if value is not None
+    }
+    if method == "interpolate" and data.grid is not None:
+        if tolerances:
+            # Interpolation bounds the maximum error, and with it the average.
+            options["tolerance"] = min(tolerances.values())
+        return jaxfit.interpolate(data.grid, **options)
+    return jaxfit.fit_points(data.cloud, boundary, net=args.net, **tolerances, **options)
+
+
+def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, maximum: float) -> bool:
+    if method == "interpolate" and args.tol_average is None and args.tol_maximum is None:
+        return bool(fit.converged)
+    # Without a requested tolerance every finite fit will do.
+    return all(
+        tolerance is None or error <= tolerance / 100
+        for error, tolerance in ((average, args.tol_average), (maximum, args.tol_maximum))
+    )

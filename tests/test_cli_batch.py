@@ -1,0 +1,205 @@
+"""`jaxfit batch`: one table of many files, whatever is wrong with some, whoever fits them."""
+
+import csv
+import json
+import os
+import sys
+from concurrent.futures import BrokenExecutor, Future
+
+import numpy as np
+import pytest
+from helpers import wavy_cloud, wavy_grid
+
+from jaxfit import _cli, _cli_workers
+from jaxfit._cli_table import COLUMNS
+from jaxfit._cli_workers import Processes, Schedule
+from jaxfit.io import read_surface
+
+GOOD = ["a.npz", "b.npz", "grid.npz"]
+BAD = ["garbage.npz", "none.npz", "nan.npz"]
+OPTIONS = "--net 6x6 --max-steps 3 --quiet".split()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    for i, name in enumerate("ab"):
+        points, edges = wavy_cloud(100, seed=i)
+        sides = {f"boundary_{side}": polyline for side, polyline in edges.items()}
+        np.savez(tmp_path / f"{name}.npz", points=points, **sides)
+    np.savez(tmp_path / "nan.npz", points=np.nan * points, **sides)
+    np.savez(tmp_path / "grid.npz", grid=wavy_grid(8, 7))
+    (tmp_path / "garbage.npz").write_text("no points")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
+    return tmp_path
+
+
+def batch(*argv):
+    return _cli.main(["batch", *argv, "-o", "out", *OPTIONS])
+
+
+def rows():
+    with open("out/table.jsonl") as lines:
+        found = [json.loads(line) for line in lines]
+    with open("out/table.csv", newline="") as file:
+        sheet = list(csv.DictReader(file))
+    assert [row["input"] for row in sheet] == [row["input"] for row in found]
+    assert all(tuple(row) == tuple(COLUMNS) for row in [*found, *sheet])
+    return {os.path.basename(row["input"]): row for row in found}
+
+
+def state():
+    return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in os.scandir("out")}
+
+
+def test_bad_files_are_reported_and_passed_over(folder, capsys):
+    assert batch(BAD[0], *GOOD, *BAD[1:]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 3
+    assert all(name in line for name, line in zip(BAD, said, strict=True))
+    table = rows()
+    assert list(table) == [BAD[0], *GOOD, *BAD[1:]]
+    assert "is damaged" in table["garbage.npz"]["error"]
+    assert "does not exist" in table["none.npz"]["error"]
+    assert "NaN" in table["nan.npz"]["error"]
+    assert sorted(os.listdir("out")) == [*GOOD, "table.csv", "table.jsonl"]
+    for name in GOOD:
+        assert read_surface(f"out/{name}").shape == (6, 6)
+        assert (table[name]["net"], table[name]["status"]) == ("6x6", "fitted")
+        assert 0 < table[name]["average_error_percent"] < 1
+
+    before = state()  # a second run does nothing
+    assert batch(BAD[0], *GOOD, *BAD[1:]) == 3
+    assert state() == before
+    assert capsys.readouterr().err == ""
+
+
+def test_what_has_changed_is_fitted_again(folder, monkeypatch):
+    fitted = []
+    real = _cli_workers.Here.submit
+    monkeypatch.setattr(
+        _cli_workers.Here,
+        "submit",
+        lambda self, function, job: (
+            fitted.append(os.path.basename(job.arguments["input"])) or real(self, function, job)
+        ),
+    )
+
+    def run(*argv):
+        fitted.clear()
+        return batch(*argv), list(fitted)
+
+    assert run("a.npz", "grid.npz") == (0, ["a.npz", "grid.npz"])
+    assert run("a.npz", "grid.npz", "nan.npz") == (3, ["nan.npz"])
+    assert run("nan.npz", "--retry-failed") == (3, ["nan.npz"])
+    os.utime("a.npz", ns=(0, 0))
+    assert run("a.npz", "grid.npz") == (0, ["a.npz"])
+    os.unlink("out/grid.npz")
+    assert run("a.npz", "grid.npz") == (0, ["grid.npz"])
+    assert run("grid.npz", "--tol-maximum", "1e-9") == (1, ["grid.npz"])
+    (folder / "a.npz").write_text("no points any more")
+    assert run("a.npz") == (3, ["a.npz"])
+    assert not os.path.exists("out/a.npz")
+    assert list(rows()) == ["nan.npz", "grid.npz", "a.npz"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["a.npz", "other/a.npz"], "would both write a.npz"),
+        (["a.npz", "-o", "."], "holds the file"),
+        (["a.npz", "-o", "a.npz"], "cannot be made"),
+        (["a.npz", "--workers", "0"], "'0' is no number of processes"),
+        (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
+        (["a.npz", "--scheduler", "tcp://x"], "pip install 'jaxfit-surfaces[cluster]'"),
+        ([], "FILE"),
+    ],
+)
+def test_bad_usage_is_one_sentence(folder, capsys, monkeypatch, argv, said):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    output = [] if "-o" in argv else ["-o", "out"]
+    assert _cli.main(["batch", *argv, *output]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("jaxfit: error: ")
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+
+
+def test_a_table_that_cannot_be_read_is_left_alone(folder, capsys):
+    os.mkdir("out")
+    (folder / "out" / "table.jsonl").write_text("none")
+    assert batch("a.npz") == 2
+    assert "holds no table" in capsys.readouterr().err
+    assert (folder / "out" / "table.jsonl").read_text() == "none"
+
+
+# ------------------------------------------------------------------ who fits when
+
+
+class Pool:
+    """Takes `width` jobs at once and finishes them in turn; jobs named "fatal" end it."""
+
+    def __init__(self, width):
+        self.width, self.open, self.starts, self.ended = width, [], [], 0
+
+    def submit(self, function, job):
+        future = Future()
+        self.open.append((job, future))
+        self.starts.append((job, [other for other, _ in self.open[:-1]]))
+        return future
+
+    def finish(self):
+        if any(job.startswith("fatal") for job, _ in self.open):
+            for _, future in self.open:
+                future.set_exception(BrokenExecutor())
+            self.open.clear()
+        elif self.open:
+            job, future = self.open.pop(0)
+            future.set_result(job)
+
+    def restart(self):
+        self.ended += 1
+
+
+def run(pool, jobs, monkeypatch):
+    real = _cli_workers.wait
+    monkeypatch.setattr(
+        _cli_workers, "wait", lambda *args, **options: pool.finish() or real(*args, **options)
+    )
+    schedule = Schedule(pool, jobs, lambda job: job[-1] if job[-1].isdigit() else None)
+    return list(schedule.run(str, lambda job: f"{job} died", lambda: None))
+
+
+def test_the_first_file_of_a_size_compiles_for_the_others(monkeypatch):
+    pool = Pool(3)
+    jobs = ["a1", "b1", "c1", "d2", "e2", "f"]
+    assert sorted(run(pool, jobs, monkeypatch)) == sorted(jobs)
+    beside = dict(pool.starts)
+    assert beside["d2"] == ["a1"]  # another size does not wait
+    assert "a1" not in beside["b1"] + beside["c1"]
+    assert "d2" not in beside["e2"]
+    assert [job for job, _ in pool.starts][:3] == ["a1", "d2", "f"]
+
+
+def test_a_file_that_ends_its_process_is_found_and_passed_over(monkeypatch):
+    pool = Pool(3)
+    found = run(pool, ["a", "fatal", "b", "c", "fatal too", "d"], monkeypatch)
+    assert sorted(found) == ["a", "b", "c", "d", "fatal died", "fatal too died"]
+    assert 2 <= pool.ended <= 4
+
+
+def maybe_end(job):
+    if job == "fatal":
+        os._exit(1)
+    return os.environ["NPROC"], job
+
+
+def test_processes_that_end_are_replaced():
+    pool = Processes(2)
+    found = list(
+        Schedule(pool, ["a", "fatal", "b"], lambda job: None).run(maybe_end, lambda job: "died", lambda: None)
+    )
+    pool.shutdown()
+    share = str(max(1, len(os.sched_getaffinity(0)) // 2))
+    assert sorted(found, key=str) == [(share, "a"), (share, "b"), "died"]

@@ -1,0 +1,151 @@
+"""Many fits in one call: the same fits as one by one, whoever computes them."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import wavy_cloud
+
+import jaxfit as jf
+
+SIZES = (300, 260, 290)
+CLOUDS = [wavy_cloud(n, seed=n)[0] + [0, 0, 0.01 * i] for i, n in enumerate(SIZES)]
+BASE = jf.base_surface(jf.Boundary(**wavy_cloud(4)[1]), net=(6, 6))
+OTHER = jf.base_surface(jf.Boundary(**wavy_cloud(4, height=0.2)[1]), net=(6, 6))
+OPTIONS = {"tol_average": 0.0, "max_steps": 4}
+METHODS = [jf.GeometricApproximation(), jf.StandardApproximation(smoothing=1e-5), jf.OrthogonalDistance()]
+
+
+def name(method):
+    return type(method).__name__
+
+
+def assert_same(fit, other):
+    for a, b in zip(jax.tree.leaves(fit), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=name)
+def test_ragged_clouds_are_fitted_as_one_by_one(method):
+    fits = jf.map_fits(CLOUDS, BASE, method, **OPTIONS)
+    for cloud, fit in zip(CLOUDS, fits, strict=True):
+        assert_same(fit, jf.approximate(cloud, BASE, method, **OPTIONS))
+
+
+@pytest.mark.float32_too
+def test_a_cloud_that_is_not_finite_fails_alone():
+    bad = np.array(CLOUDS[1])
+    bad[7, 2] = np.nan
+    fits = jf.map_fits([CLOUDS[0], bad, CLOUDS[2]], BASE, **OPTIONS)
+    alone = jf.map_fits(CLOUDS, BASE, **OPTIONS)
+    assert_same((fits[0], fits[2]), (alone[0], alone[2]))
+    assert "not finite" in fits[1].message
+    assert not bool(fits[1].converged)
+    assert np.isnan(fits[1].average_error)
+    assert np.isnan(fits[1].errors).all()
+    assert fits[1].errors.shape == bad.shape[:1]
+    assert "not finite" in str(fits[1])
+    with pytest.raises(RuntimeError, match="did not converge"):
+        jf.map_fits([bad], BASE, throw=True, **OPTIONS)
+
+
+def test_bases_lambdas_and_weights_may_differ():
+    bases, lambdas = [BASE, OTHER], [1e-4, 1e-6]
+    methods = [jf.StandardApproximation(smoothing=x) for x in lambdas]
+    weights = np.random.default_rng(0).uniform(0.5, 1, (2, SIZES[0]))
+    fits = jf.map_fits(CLOUDS[0], bases, methods, weights, **OPTIONS)
+    for i, fit in enumerate(fits):
+        assert_same(fit, jf.approximate(CLOUDS[0], bases[i], methods[i], weights=weights[i], **OPTIONS))
+        assert float(fit.stats["smoothing"]) == lambdas[i]
+
+
+def test_any_executor_computes():
+    with ThreadPoolExecutor(2) as executor:
+        fits = jf.map_fits(CLOUDS, BASE, executor=executor, **OPTIONS)
+    assert_same(fits, jf.map_fits(CLOUDS, BASE, **OPTIONS))
+
+
+@pytest.mark.parametrize("method", METHODS, ids=name)
+def test_padding_has_no_influence(method):
+    def fitted(cloud, weights):
+        fit = jf.approximate(cloud, BASE, method, weights=weights, **OPTIONS)
+        return fit.surface.control_points, fit.average_error, fit.maximum_error, fit.history.average[:5]
+
+    points, weights = jf.pad_clouds(CLOUDS)
+    assert points.shape[1] > max(SIZES)
+    for i, cloud in enumerate(CLOUDS):
+        for a, b in zip(fitted(cloud, None), fitted(points[i], weights[i]), strict=True):
+            np.testing.assert_allclose(b, a, rtol=0, atol=1e-12)
+
+
+def test_padding_has_no_influence_inside_a_program():
+    points, weights = jf.pad_clouds(CLOUDS)
+    points = np.where(weights[..., None] > 0, points, points + 0.5)  # wherever the padding lies
+
+    @jax.jit
+    def fitted(points, weights):
+        fits = jf.map_fits(points, BASE, None, weights, **OPTIONS)
+        return [(fit.surface.control_points, fit.average_error, fit.maximum_error) for fit in fits]
+
+    for cloud, found in zip(CLOUDS, fitted(points, weights), strict=True):
+        alone = jf.approximate(cloud, BASE, **OPTIONS)
+        expected = alone.surface.control_points, alone.average_error, alone.maximum_error
+        for a, b in zip(expected, found, strict=True):
+            np.testing.assert_allclose(b, a, rtol=0, atol=1e-12)
+
+
+def test_closest_points_of_a_cloud_that_is_not_finite_come_to_an_end():
+    bad = np.array(CLOUDS[0][:20])
+    bad[3] = np.nan
+    found = jax.jit(lambda points: jf.closest_point(BASE, points))(bad)
+    assert not np.asarray(found.converged).any()
+
+
+def test_inside_a_transformation_the_fits_are_one_program():
+    points, weights = jf.pad_clouds(CLOUDS)
+    points[1, 3, 0] = np.nan
+    methods = [jf.StandardApproximation(smoothing=x) for x in (1e-4, 1e-5, 1e-6)]
+
+    @jax.jit
+    def fitted(points, weights):
+        return jf.map_fits(points, BASE, methods, weights, **OPTIONS)
+
+    fits = fitted(points, weights)
+    for i in (0, 2):
+        alone = jf.approximate(CLOUDS[i], BASE, methods[i], **OPTIONS)
+        np.testing.assert_allclose(
+            fits[i].surface.control_points, alone.surface.control_points, rtol=0, atol=1e-10
+        )
+    assert [bool(jnp.isfinite(fit.average_error)) for fit in fits] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((CLOUDS[0], BASE), "use approximate for a single fit"),
+        ((CLOUDS, [BASE, BASE]), "{'clouds': 3, 'base': 2}"),
+        (([CLOUDS[0], CLOUDS[1][:, :2]], BASE), r"clouds\[1\]: points must have 3 coordinates"),
+        (([CLOUDS[0], CLOUDS[1][:3]], BASE), r"clouds\[1\]: points must hold at least 4"),
+        (([CLOUDS[0], 0 * CLOUDS[1]], BASE), r"clouds\[1\]: points must not all coincide"),
+        (
+            (CLOUDS, BASE, None, [np.ones(n) for n in (300, 3, 290)]),
+            r"clouds\[1\]: weights must hold one number",
+        ),
+    ],
+)
+def test_bad_lists_get_a_sentence(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        jf.map_fits(*arguments, **OPTIONS)
+
+
+def test_names_and_sizes_get_a_sentence():
+    with pytest.raises(TypeError, match="progress is not an option of map_fits; pass any of tol_average"):
+        jf.map_fits(CLOUDS, BASE, progress=print)
+    with pytest.raises(ValueError, match="clouds must hold at least one cloud"):
+        jf.pad_clouds([])
+    with pytest.raises(ValueError, match="weights must hold one number for each point"):
+        jf.pad_clouds(CLOUDS, CLOUDS)
+    with pytest.raises(ValueError, match="see pad_clouds"):
+        jax.jit(lambda cloud: jf.map_fits([cloud, CLOUDS[1]], BASE)[0].average_error)(CLOUDS[0])
