@@ -111,7 +111,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         The longest move of a control point in a step with mu below 1, correction included, as a share of the
         distance to its neighbours (default 0.6).
     foot_method, foot_tolerance, stall_window, stall_gain
-        As for GeometricApproximation (defaults Newton(), 1e-12, 20, 2e-3).
+        As for GeometricApproximation (defaults Newton(), 1e-12, 20, 1e-2).
 
     Raises
     ------
@@ -122,14 +122,14 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     Notes
     -----
-    The fit's `stats` contain `damping`, the last mu, and `rejected_steps`, the number of rejected steps; with
-    a thin plate also `smoothing`, lambda, and `bending_energy`, the integral (10) in the squared unit of the
-    data.
+    The fit's `stats` contain `damping`, the last mu, and `rejected_steps`, the number of rejected steps. With
+    RegularSmoothing also `points_out_of_reach`: points four times as far as the average one where the surface
+    has been kept from folding, such as those of a pocket under the sheet. With a thin plate also `smoothing`,
+    lambda, and `bending_energy`, the integral (10) in the squared unit of the data.
 
-    Folds of the base surface may stay, and with a thin plate or without smoothing new ones may form where
-    the base is far from the points, the net too coarse, or the points lie in a pocket under the sheet. A
-    base made with the points (`Meshless`, `DynamicBaseSurface`) or a finer net is the remedy. Where smoothing
-    is 0, control points that influence few points may move far.
+    Folds of the base surface may stay, at a fixed corner for instance. With a thin plate or without smoothing
+    new ones may form where the base is far from the points, the net too coarse, or the points lie in a
+    pocket. Where smoothing is 0, control points that influence few points may move far.
 
     This is tangent distance minimisation, damped: the Gauss-Newton method for variable projection (Golub and
     Pereyra, SIAM J. Numer. Anal. 10, 1973) of this problem; Wang, Pottmann and Liu, ACM Trans. Graph. 25,

@@ -39,20 +39,23 @@ class RegularSmoothing(eqx.Module):
     to the next. The thin plate is slack where the net is narrow, for there second derivatives are
     small; this term is not.
 
-    $\rho$ is the mean square of the distances. So the whole objective, divided by it, compares numbers
-    without unit: smoothing falls to nothing where all points can be met, and does not depend on the number
-    of points, their unit, or the size of the net.
+    $\rho$ is the mean square of the distances (weighted ones, over the number of points), and less where
+    these are below 3e-5 of the diagonal on average. So the objective, divided by it, compares numbers without
+    unit: a bend counts as much as some points at the usual distance. Smoothing fades where all points can be
+    met, follows the noise where they cannot, and depends neither on the unit nor on the weights' scale. The
+    more points there are to a control point, the less it bends the surface, as with any prior knowledge.
 
     The factors $c_{ij}$ fall from `first` to `least` from step to step. A step after which the surface would
-    have more folds than before is rejected, and the factors around the new ones are raised; they fall again,
-    but more slowly. A surface without folds therefore remains so, on the samples: 8 in each
-    direction of a cell, whose normals may turn by 60 degrees from one to the next.
+    have more folds than before is rejected; the control points around the new ones stay where they are for
+    the next one to three accepted steps, and their factors are raised and fall again more slowly. So a
+    surface without folds remains so on the samples: 8 in each direction of a cell, whose normals
+    may turn by 60 degrees from one to the next. Points that ask for a fold remain far away.
 
     Parameters
     ----------
     least : float
-        The factor where nothing folds (default 8). 8 means that a bend of a third of a radian between two
-        control points counts as one point at the usual distance.
+        The factor where nothing folds (default 5): a bend of 0.45 radian between two control points counts
+        as one point at the usual distance.
     first : float
         The factor of the first step (default 100).
     fall : float
@@ -66,6 +69,13 @@ class RegularSmoothing(eqx.Module):
     ------
     ValueError
         If an option is out of range.
+
+    Notes
+    -----
+    From the same bases at 42 x 42 control points, tolerance out of reach, it leaves no fold and smaller average
+    errors than a thin plate of any weight that leaves as few. With noise of 0.1 to 1 % of the diagonal the
+    distance from the clean surface was within 1.2 times that of the best weight. `first` matters: the
+    large shape has to settle before detail is followed.
 
     Examples
     --------

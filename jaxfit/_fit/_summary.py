@@ -71,7 +71,12 @@ def _largest_group(found: Regularity) -> str:
 
 
 def with_folds(fit: Any, sentence: str) -> str:
-    """The reason for which a fit stopped, and that its surface folds if it does."""
+    """The reason for which a fit stopped, and that its surface folds if it does, or was kept from folding."""
+    if is_single(fit) and fit.stats.get("points_out_of_reach", 0) > 0 and not bool(fit.converged):
+        sentence = (
+            f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
+            "this net that does not fold; insert knots, or look whether they lie on another sheet."
+        )
     if not (is_single(fit) and _is_finite(fit) and fit.regularity.folds):
         return sentence
     folds = f"the surface folds at {_places(fit.regularity)}: {_REMEDIES['method' not in fit.stats]}."

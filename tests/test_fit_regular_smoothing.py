@@ -1,0 +1,123 @@
+"""Smoothing that keeps a surface whole: no folds, exact where the points allow it, and no fit to noise."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import clamped_uniform, data, diagonal, grid_edges, wavy_cloud, wavy_net
+
+import jaxfit as jf
+from jaxfit._approximation._folds import folds_by_cell, near_folds
+from jaxfit._normal_equations import Roughness
+from jaxfit._splines._pieces import make_pieces
+
+
+def sheet(x, y):
+    return np.stack([x, y, 0.1 * np.sin(3 * x + 0.5) * np.cos(2.5 * y)], axis=-1)
+
+
+def pocketed():
+    """A sheet, and under its middle a bowl that a surface reaches only by folding; which points are the bowl's."""
+    rng = np.random.default_rng(0)
+    flat = sheet(*rng.uniform(size=(2, 1500)))
+    radius, angle = 0.12 * np.sqrt(rng.uniform(size=150)), 2 * np.pi * rng.uniform(size=150)
+    bowl = sheet(0.5 + radius * np.cos(angle), 0.5 + radius * np.sin(angle))
+    bowl[:, 2] -= 0.12 * np.sqrt(1 - (radius / 0.12) ** 2)
+    return np.concatenate([flat, bowl]), np.arange(1650) >= 1500
+
+
+@pytest.fixture(scope="module")
+def base():
+    grid = sheet(*np.meshgrid(*2 * [np.linspace(0, 1, 33)], indexing="ij"))
+    return jf.base_surface(jf.Boundary(**grid_edges(grid)), net=(14, 14))
+
+
+def test_a_pocket_under_the_sheet_makes_no_fold_and_is_out_of_reach(base):
+    points, bowl = pocketed()
+    fit = jf.approximate(points, base, tol_average=1e-6, max_steps=60)
+    assert not fit.converged
+    assert fit.regularity.folds == 0
+    assert 20 < int(fit.stats["points_out_of_reach"]) <= np.sum(bowl)
+    assert "out of reach" in fit.message
+    plate = jf.OrthogonalDistance(smoothing=1e-9)
+    assert jf.approximate(points, base, plate, tol_average=1e-6, max_steps=60).regularity.folds > 20
+
+
+def test_noise_is_not_fitted(base):
+    clean = sheet(*np.random.default_rng(1).uniform(size=(2, 1500)))
+    noisy = clean + 0.01 * np.random.default_rng(2).normal(size=clean.shape)
+    away = {}
+    for smoothing in (jf.RegularSmoothing(), 1e-9, 1e-7, 1e-6, 1e-5):
+        method = jf.OrthogonalDistance(smoothing=smoothing)
+        fit = jf.approximate(noisy, base, method, tol_average=1e-6, max_steps=30)
+        away[smoothing] = float(jnp.mean(jf.closest_point(fit.surface, clean).distance))
+    automatic = away.pop(jf.RegularSmoothing())
+    assert automatic < 1.3 * min(away.values())
+    assert automatic < 0.6 * away[1e-9]
+
+
+def test_weights_and_units_have_no_influence(base):
+    points, _ = wavy_cloud(300)
+    fit = jf.approximate(points, base, tol_average=1e-6, max_steps=5)
+    other = jf.BSplineSurface(64.0 * base.control_points, base.knots_u, base.knots_v)
+    scaled = jf.approximate(64.0 * points, other, tol_average=1e-6, max_steps=5, weights=np.full(300, 4.0))
+    assert np.abs(np.asarray(scaled.surface.control_points) / 64 - fit.surface.control_points).max() < 1e-6
+
+
+def test_a_spline_surface_is_found_again():
+    got = data("bspline_reference")
+    net, size = got["control_points"], diagonal(got["points"])
+    knots = [got[x] / got[x][-1] for x in ("knots_u", "knots_v")]
+    off = net.copy()
+    off[1:-1, 1:-1] += 0.05 * size * np.random.default_rng(0).uniform(-1, 1, off[1:-1, 1:-1].shape)
+    fit = jf.approximate(got["points"], jf.BSplineSurface(off, *knots), tol_average=2e-13)
+    away = jf.closest_point(fit.surface, got["grid40"].reshape(-1, 3)).distance
+    assert float(jnp.max(away)) < 1e-10 * size
+    assert int(fit.stats["num_steps"]) < 40
+
+
+@pytest.mark.parametrize("order", [(4, 4), (3, 5), (2, 4)])
+def test_roughness_is_its_matrix_and_ignores_even_nets(order):
+    rng = np.random.default_rng(0)
+    net = rng.normal(size=(8, 7, 3))
+    knots = [
+        np.sort(np.concatenate([np.zeros(k), rng.uniform(size=n - k), np.ones(k)]))
+        for n, k in zip((8, 7), order)
+    ]
+    form = Roughness.of(jnp.asarray(net), *knots, jnp.asarray(rng.uniform(1, 2, size=(8, 7))))
+    matrix, image = form.system(jnp.asarray(net))
+    flat = net.reshape(-1, 3)
+    dense = np.asarray(matrix.dense())
+    assert np.isclose(
+        float(form.energy(jnp.asarray(net))), np.einsum("ic,ij,jc", flat, dense, flat), rtol=1e-12
+    )
+    assert np.allclose(dense @ flat, np.asarray(image).reshape(-1, 3))
+    assert np.linalg.eigvalsh(dense).min() > -1e-9 * np.abs(dense).max()
+    u, v = (np.asarray(jf.greville_abscissae(x, k)) for x, k in zip(knots, order))
+    even = np.stack(np.broadcast_arrays(u[:, None], v[None, :], 2 * u[:, None] - v[None, :]), axis=-1)
+    assert float(form.energy(jnp.asarray(even))) < 1e-20 * float(form.energy(jnp.asarray(net)))
+
+
+def test_folds_are_found_in_the_cell_they_are_in():
+    knots, net = clamped_uniform(9, 4), wavy_net(9, 9)
+    assert not np.asarray(folds_by_cell(make_pieces(jnp.asarray(net), knots, knots))).any()
+    net[4, 4:6, 0] -= 0.4  # two control points pushed past those before
+    folds = np.asarray(folds_by_cell(make_pieces(jnp.asarray(net), knots, knots)))
+    assert folds[1:4, 1:5].sum() > 0
+    assert not folds[5:].any()
+    near = np.asarray(near_folds(jnp.asarray(folds), (4, 4)))
+    assert near.shape == (9, 9)
+    assert near[4, 4]
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({"least": 0.0}, "least, first and most must be positive"),
+        ({"first": 1.0}, "least, first and most must be positive and not decrease"),
+        ({"fall": 1.0}, "fall must lie between 0 and 1"),
+        ({"raised": 1.0}, "raised be greater than 1"),
+    ],
+)
+def test_impossible_fields_get_a_sentence(fields, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jf.RegularSmoothing(**fields)
