@@ -16,7 +16,7 @@ def sheet(x, y):
 
 
 def pocketed():
-    """A sheet, and under its middle a bowl that a surface reaches only by folding; which points are the bowl's."""
+    """A sheet with a bowl under it that a surface reaches only by folding; which points are the bowl."""
     rng = np.random.default_rng(0)
     flat = sheet(*rng.uniform(size=(2, 1500)))
     radius, angle = 0.12 * np.sqrt(rng.uniform(size=150)), 2 * np.pi * rng.uniform(size=150)
@@ -81,7 +81,7 @@ def test_roughness_is_its_matrix_and_ignores_even_nets(order):
     net = rng.normal(size=(8, 7, 3))
     knots = [
         np.sort(np.concatenate([np.zeros(k), rng.uniform(size=n - k), np.ones(k)]))
-        for n, k in zip((8, 7), order)
+        for n, k in zip((8, 7), order, strict=True)
     ]
     form = Roughness.of(jnp.asarray(net), *knots, jnp.asarray(rng.uniform(1, 2, size=(8, 7))))
     matrix, image = form.system(jnp.asarray(net))
@@ -92,7 +92,7 @@ def test_roughness_is_its_matrix_and_ignores_even_nets(order):
     )
     assert np.allclose(dense @ flat, np.asarray(image).reshape(-1, 3))
     assert np.linalg.eigvalsh(dense).min() > -1e-9 * np.abs(dense).max()
-    u, v = (np.asarray(jf.greville_abscissae(x, k)) for x, k in zip(knots, order))
+    u, v = (np.asarray(jf.greville_abscissae(x, k)) for x, k in zip(knots, order, strict=True))
     even = np.stack(np.broadcast_arrays(u[:, None], v[None, :], 2 * u[:, None] - v[None, :]), axis=-1)
     assert float(form.energy(jnp.asarray(even))) < 1e-20 * float(form.energy(jnp.asarray(net)))
 

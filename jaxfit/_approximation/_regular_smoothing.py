@@ -72,8 +72,8 @@ class RegularSmoothing(eqx.Module):
 
     Notes
     -----
-    From the same bases at 42 x 42 control points, tolerance out of reach, it leaves no fold and smaller average
-    errors than a thin plate of any weight that leaves as few. With noise of 0.1 to 1 % of the diagonal the
+    From the same bases at 42 x 42 control points, with tolerances out of reach, average errors are less than
+    those of a thin plate of any weight that leaves as few folds. With noise of 0.1 to 1 % of the diagonal the
     distance from the clean surface was within 1.2 times that of the best weight. `first` matters: the
     large shape has to settle before detail is followed.
 
