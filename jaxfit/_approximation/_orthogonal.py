@@ -267,8 +267,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
             plate = plate_of(state.plate, surface)
             penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
-            size = total_cost(self.loss, length, problem.weight, here.error) / jnp.sum(problem.counted)
-            penalty = self.smoothing.penalty(guard, surface, size, problem.diagonal)
+            cost = total_cost(self.loss, length, problem.weight, here.error)
+            penalty = self.smoothing.penalty(guard, surface, problem, cost)
 
         def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)

@@ -72,10 +72,11 @@ class RegularSmoothing(eqx.Module):
 
     Notes
     -----
-    From the same bases at 42 x 42 control points, with tolerances out of reach, average errors are less than
-    those of a thin plate of any weight that leaves as few folds. With noise of 0.1 to 1 % of the diagonal the
-    distance from the clean surface was within 1.2 times that of the best weight. `first` matters: the
-    large shape has to settle before detail is followed.
+    On scans of faces and terrain, with tolerances out of reach, average errors are less than those of a thin
+    plate of weight 5e-6 against the sum over the points, and there are no folds. With noise of 0.1 to 1 % of
+    the diagonal the distance from the clean surface of one face was within 1.05 times that of the best of
+    four thin plates. Where a surface is far smoother than its net it was 1.7 times that: there a coarser net
+    or a greater `least` is better. `first` matters: the large shape has to settle before detail is followed.
 
     Examples
     --------
@@ -113,11 +114,14 @@ class RegularSmoothing(eqx.Module):
         nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
         return FoldGuard(factor, floor, zero, zero, folds), nothing
 
-    def penalty(self, guard: "FoldGuard", surface: WorkingSurface, size: Array, diagonal: Array) -> Roughness:
-        """The smoothing term of a step from a surface whose distances have the mean square `size`."""
+    def penalty(
+        self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, cost: Array
+    ) -> Roughness:
+        """The smoothing term of a step from a surface at which the data term of the objective is `cost`."""
         knots, net = (surface.knots_u, surface.knots_v), jnp.asarray(surface.control_points)
-        weight = size * jnp.minimum(jnp.sqrt(size) / (FINE * diagonal), 1.0)
-        return Roughness.of(net, *knots, weight * jnp.asarray(guard.factor))
+        distance = jnp.sqrt(cost / jnp.sum(problem.weight)) / problem.diagonal
+        rho = cost / jnp.sum(problem.counted) * jnp.minimum(distance / FINE, 1.0)
+        return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 
     def after(
         self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any
