@@ -225,7 +225,7 @@ def test_a_smooth_cloud_is_met_and_errors_are_distances_to_closest_points(base):
 def test_held_and_untouched_control_points_keep_every_bit(base):
     surface = base.affine(np.eye(3), np.array([0.1, 0.2, 0.3]))
     some = POINTS[(POINTS[:, 0] < 0.3) & (POINTS[:, 1] < 0.4)] + np.array([0.1, 0.2, 0.3])
-    fit = jf.approximate(some, surface, max_steps=3, tol_average=1e-9)
+    fit = jf.approximate(some, surface, jf.GeometricApproximation(), max_steps=3, tol_average=1e-9)
     before, after = np.asarray(surface.control_points), np.asarray(fit.surface.control_points)
     for held in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
         assert (before[held] == after[held]).all()
@@ -238,8 +238,8 @@ def test_points_of_weight_zero_do_not_pull(base):
     outlier = np.concatenate([POINTS, [[0.5, 0.5, 3.0]]])
     weights = np.r_[np.ones(500), 0.0]
     options = dict(max_steps=4, tol_average=1e-9)
-    with_it = jf.approximate(outlier, base, weights=weights, **options)
-    without = jf.approximate(POINTS, base, **options)
+    with_it = jf.approximate(outlier, base, jf.GeometricApproximation(), weights=weights, **options)
+    without = jf.approximate(POINTS, base, jf.GeometricApproximation(), **options)
     difference = with_it.surface.control_points - without.surface.control_points
     assert np.abs(np.asarray(difference)).max() < 1e-12
     assert float(with_it.errors[-1]) > 0.5
@@ -248,8 +248,8 @@ def test_points_of_weight_zero_do_not_pull(base):
 
 def test_the_order_of_the_points_does_not_matter(base):
     options = dict(max_steps=5, tol_average=1e-9)
-    mixed = jf.approximate(POINTS[::-1], base, **options)
-    plain = jf.approximate(POINTS, base, **options)
+    mixed = jf.approximate(POINTS[::-1], base, jf.GeometricApproximation(), **options)
+    plain = jf.approximate(POINTS, base, jf.GeometricApproximation(), **options)
     difference = mixed.surface.control_points - plain.surface.control_points
     assert np.abs(np.asarray(difference)).max() < 1e-12
     assert np.abs(np.asarray(mixed.errors)[::-1] - np.asarray(plain.errors)).max() < 1e-12
@@ -259,8 +259,12 @@ def test_motion_and_scale_of_the_problem_move_and_scale_the_fit(base):
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     matrix, offset = 250.0 * turn, np.array([5e5, -3e5, 1e4])
     options = dict(max_steps=5, tol_average=1e-9)
-    plain = jf.approximate(POINTS, base, **options).surface.affine(matrix, offset)
-    moved = jf.approximate(POINTS @ matrix.T + offset, base.affine(matrix, offset), **options)
+    plain = jf.approximate(POINTS, base, jf.GeometricApproximation(), **options).surface.affine(
+        matrix, offset
+    )
+    moved = jf.approximate(
+        POINTS @ matrix.T + offset, base.affine(matrix, offset), jf.GeometricApproximation(), **options
+    )
     difference = np.asarray(moved.surface.control_points) - np.asarray(plain.control_points)
     assert np.abs(difference).max() < 1e-9 * 250 * 1.5
 
@@ -286,7 +290,9 @@ def test_vmap_inside_jit_gives_the_same_as_plain_calls(base):
     start = feet_on(base)
 
     def net(points):
-        fit = jf.approximate(points, base, max_steps=3, tol_average=1e-9, start=start)
+        fit = jf.approximate(
+            points, base, jf.GeometricApproximation(), max_steps=3, tol_average=1e-9, start=start
+        )
         return fit.surface.control_points, fit.average_error
 
     clouds = jnp.stack([jnp.asarray(POINTS), jnp.asarray(POINTS) * jnp.asarray([[1, 1, 0.5]])])
@@ -301,7 +307,9 @@ def test_differentiating_through_a_fit_raises_a_sentence(base):
     start = feet_on(base)
 
     def height(points):
-        return jf.approximate(points, base, max_steps=2, tol_average=1e-9, start=start).average_error
+        return jf.approximate(
+            points, base, jf.GeometricApproximation(), max_steps=2, tol_average=1e-9, start=start
+        ).average_error
 
     with pytest.raises(TypeError, match="a fit has no derivative"):
         jax.jvp(height, (jnp.asarray(POINTS),), (jnp.asarray(POINTS),))
