@@ -41,7 +41,7 @@ def test_the_order_of_the_points_has_no_influence(grown):
     other = jf.fit_points(CLEAN[order], BOUNDARY, tol_average=1e-4)
     assert other.surface.shape == grown.surface.shape
     moved = np.asarray(other.surface.control_points) - np.asarray(grown.surface.control_points)
-    assert np.abs(moved).max() < 1e-4
+    assert np.abs(moved).max() < 1e-6
 
 
 def test_noise_ends_the_growth_and_is_not_followed():
@@ -53,7 +53,7 @@ def test_noise_ends_the_growth_and_is_not_followed():
     away = np.asarray(jf.closest_point(fit.surface, CLEAN).distance).mean() / size
     fixed = [jf.fit_points(noisy, BOUNDARY, net=(n, n), tol_average=1e-6, max_steps=20) for n in (10, 24)]
     others = [np.asarray(jf.closest_point(x.surface, CLEAN).distance).mean() / size for x in fixed]
-    assert away < 1.5 * min(others)
+    assert away < 1.4 * min(others)  # measured: 1.32
     assert away < 0.4 * noise
 
 

@@ -15,7 +15,9 @@ METHODS = {
     "standard": jf.StandardApproximation(smoothing=1e-6),
     "robust": jf.StandardApproximation(smoothing=1e-6, loss=jf.Huber()),
     "orthogonal": jf.OrthogonalDistance(smoothing=1e-6),
+    "default": jf.OrthogonalDistance(),
 }
+MAGNIFIES = ("orthogonal", "default")  # rounding, by conjugate gradients that end before they converge
 OPTIONS = dict(tol_average=1e-9, max_steps=12)
 
 
@@ -28,11 +30,10 @@ def base():
 def test_points_of_weight_zero_have_no_influence(base, name):
     away = np.random.default_rng(0).uniform(-2, 3, (100, 3))
     cloud, weights = np.concatenate([POINTS, away]), np.repeat([1.0, 0.0], [200, 100])
-    options = OPTIONS | ({"max_steps": 2} if name == "orthogonal" else {})  # later steps magnify rounding
-    alone = jf.approximate(POINTS, base, METHODS[name], **options)
-    padded = jf.approximate(cloud, base, METHODS[name], weights=weights, **options)
+    alone = jf.approximate(POINTS, base, METHODS[name], **OPTIONS)
+    padded = jf.approximate(cloud, base, METHODS[name], weights=weights, **OPTIONS)
     difference = np.asarray(alone.surface.control_points - padded.surface.control_points)
-    assert np.abs(difference).max() < 1e-10
+    assert np.abs(difference).max() < (1e-7 if name in MAGNIFIES else 1e-10)
     np.testing.assert_allclose(alone.history.average, padded.history.average, rtol=1e-7)
     assert np.isclose(alone.average_error, padded.average_error, rtol=1e-7)
     assert float(padded.errors[200:].min()) > 0
@@ -57,19 +58,18 @@ def test_a_derivative_that_a_fit_has_not_is_refused(base, what):
         jax.grad(height)(jnp.asarray([1e-5]))
 
 
-@pytest.mark.parametrize("name", ["geometric", "orthogonal"])
+@pytest.mark.parametrize("name", ["geometric", "orthogonal", "default"])
 def test_a_batch_of_fits_is_the_fits_one_by_one(base, name):
     clouds = jnp.stack([POINTS, POINTS + 0.01, POINTS * 1.02])
-    options = OPTIONS | ({"max_steps": 2} if name == "orthogonal" else {})  # later steps magnify rounding
 
     def net(points):
-        return jf.approximate(points, base, METHODS[name], **options).surface.control_points
+        return jf.approximate(points, base, METHODS[name], **OPTIONS).surface.control_points
 
     batch = jax.jit(jax.vmap(net))(clouds)
     single = jax.jit(net)
     for one, cloud in zip(batch, clouds, strict=True):
         apart = np.abs(np.asarray(one - single(cloud))).max()
-        assert apart < (1e-8 if name == "orthogonal" else 1e-12)
+        assert apart < (1e-7 if name in MAGNIFIES else 1e-12)
 
 
 def test_other_values_of_numbers_compile_nothing(base):

@@ -16,10 +16,10 @@ from jaxfit._splines._pieces import Axis
 POOR, GOOD = 0.25, 0.5
 RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # The damping falls below its usual minimum only after steps that achieve the predicted reduction and remove
-# much of the objective. Convergence is then superlinear where all points can be met. The minimum is lower
-# where a smoothing term keeps the net from sliding far.
-EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.5, 1e-12
-USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-6
+# a good part of the objective. Convergence is then superlinear where all points can be met. Otherwise a lower
+# minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding.
+EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.1, 1e-12
+USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 
 
@@ -48,11 +48,11 @@ def is_plausible(state: DampingState, gain: Array, longest_move: Array) -> Array
 
 
 def next_damping(
-    state: DampingState, before: Array, gain: Array, good: Array, usual: float = USUAL_DAMPING
+    state: DampingState, before: Array, gain: Array, good: Array, usual: Any = USUAL_DAMPING
 ) -> Array:
     """The damping of the next step, from the actual reduction `gain` and the predicted one."""
     superb = (gain > EXCELLENT * state.predicted) & (gain > MUCH * before)
-    least = jnp.where(superb, LEAST_DAMPING, jnp.minimum(state.damping, usual))
+    least = jnp.where(superb, LEAST_DAMPING, usual)
     factor = jnp.where(gain > GOOD * state.predicted, LOWERED, 1.0)
     factor = jnp.where(gain < POOR * state.predicted, RAISED, factor)
     factor = jnp.where(good, factor, TAKEN_BACK)

@@ -102,9 +102,12 @@ def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int
 def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
     """Whether points can be held out of the fit, and nothing asks for one net."""
     goals = [options.get(name, _DEFAULTS[name]) for name in ("tol_average", "tol_maximum")]
+    if not is_concrete(cloud, options):
+        return False
+    weights = options.get("weights")
+    counted = len(cloud) if weights is None else np.count_nonzero(np.asarray(weights) > 0)
     return (
-        is_concrete(cloud, options)
-        and len(cloud) >= LEAST_POINTS_TO_GROW
+        counted >= LEAST_POINTS_TO_GROW
         and getattr(method, "insertion", None) is None
         and options.get("start") is None
         and any(goal is not None for goal in goals)

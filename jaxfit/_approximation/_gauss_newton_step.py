@@ -17,8 +17,8 @@ from jaxfit._normal_equations import (
     solve_coupled,
 )
 
-RESIDUAL = 1e-2  # of a step's linear system, where conjugate gradients stop
-MOST_STEPS = 60  # of conjugate gradients
+RESIDUAL = 1e-6  # of a step's linear system, where conjugate gradients stop, if MOST_STEPS do not end them
+MOST_STEPS = 60  # of conjugate gradients: as a rule all of them, so that rounding does not decide the number
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 

@@ -20,9 +20,10 @@ BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that w
 LEVEL_STEPS = 20  # iterations with each net but the last
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
-POINTS_A_CONTROL_POINT = 3  # at least; and of a large cloud so many times
-THINNED = 16  # of these, but never fewer than
-ENOUGH = 20_000  # points are used to choose a net
+POINTS_A_CONTROL_POINT = 3  # at least, of any net
+# A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
+# POINTS_TO_CHOOSE for each control point.
+ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
@@ -49,8 +50,10 @@ class NetGrowth:
         self.request = request
         given = request["weights"]
         self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
-        self.sorted = np.lexsort(points.T)  # an even choice, whatever order the points came in
-        self.most = float(np.sqrt(len(points) / POINTS_A_CONTROL_POINT))
+        counted = np.flatnonzero(self.weights > 0)
+        # Sorted, so that every n-th of them is an even choice, whatever order the points came in.
+        self.sorted = counted[np.lexsort(points[counted].T)]
+        self.most = float(np.sqrt(len(counted) / POINTS_A_CONTROL_POINT))
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
@@ -76,24 +79,23 @@ class NetGrowth:
 
     def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
         some, held_out = self._chosen(size)
-        weights = self.weights[some]
         same = before is not None and len(before.fit.u) == len(some)
         request = self.request | {
-            "weights": np.where(held_out, 0.0, weights),
+            "weights": np.where(held_out, 0.0, self.weights[some]),
             "start": (before.fit.u, before.fit.v) if before is not None and same else None,
             "max_steps": min(LEVEL_STEPS, self.request["max_steps"]),
             "throw": False,
             "errors": LocalFeet(),
         }
         fit = fit_cloud(self.points[some], base, self.method, request)
-        return Level(size, fit, float(np.asarray(fit.errors)[held_out & (weights > 0)].mean()))
+        return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()))
 
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
         most = ENOUGH
-        while most < THINNED * POINTS_A_CONTROL_POINT * size**2:
+        while most < POINTS_TO_CHOOSE * size**2:
             most *= 2
-        some = self.sorted[:: -(-len(self.points) // most)]
+        some = self.sorted[:: -(-len(self.sorted) // most)]
         return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
 
     def _growth(self, fit: Fit) -> float:
@@ -119,6 +121,6 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
         if bool(fit.converged) or size > growth.most:
             break
         fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request)
-    if not bool(fit.converged) and why != RESULTS.converged:
+    if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit
