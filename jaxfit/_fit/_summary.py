@@ -30,6 +30,7 @@ def facts(fit: Any) -> dict[str, str]:
         "iterations": str(int(fit.stats["num_steps"])),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal",
+        **_trim_facts(fit),
         **_regularity_facts(fit),
         "stopped": fit.message,
     }
@@ -52,6 +53,24 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
         f"ratio {least:.2g} to {largest:.2g}",
         "energies": energy,
     }
+
+
+def _trim_facts(fit: Any) -> dict[str, str]:
+    """The loops, and the errors of the points inside them."""
+    trimmed = getattr(fit, "trimmed", None)
+    if trimmed is None or not _is_finite(fit):
+        return {}
+    holes = {0: "no hole", 1: "one hole"}.get(trimmed.holes, f"{trimmed.holes:,} holes")
+    inside, errors = np.asarray(fit.inside), 100 * np.asarray(fit.errors, float)
+    within = f"{int(inside.sum()):,} of {inside.size:,} points"
+    if inside.any():
+        kept = errors[inside]
+        within += f", average error {kept.mean():.4g} %, maximum {kept.max():.4g} %"
+    places = fit.regularity.fold_parameters
+    if len(places):
+        within += f"; {int(np.asarray(trimmed.contains(*places.T)).sum()):,} folds"
+    outer = len(trimmed.loops[0])
+    return {"loops": f"the outer one with {outer:,} vertices, {holes}", "inside the loops": within}
 
 
 def _samples(found: Regularity) -> str:
@@ -94,7 +113,7 @@ def describe(fit: "Fit") -> str:
     if not is_single(fit):
         return eqx.tree_pformat(fit)
     rows = {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)}
-    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+    return "\n".join(f"{name:<18}{value}" for name, value in rows.items())
 
 
 def describe_briefly(fit: "Fit") -> str:
