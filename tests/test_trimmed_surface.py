@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import wavy_surface
+from helpers import diagonal, wavy_surface
 
 import jaxfit as jf
 from jaxfit._trimmed._inside import inside_on_grid
@@ -144,3 +144,40 @@ def test_a_fit_tells_its_loops_and_the_errors_inside():
     said = str(fit)
     assert "the outer one with 6 vertices, 2 holes" in said
     assert f"{int(np.asarray(fit.inside).sum())} of 56 points, average error" in said
+
+
+@pytest.mark.parametrize("which", LOOPS)
+def test_triangles_fill_the_loops_and_keep_to_the_surface(which):
+    trimmed = jf.TrimmedSurface(wavy_surface(9, 8), LOOPS[which])
+    vertices, triangles, u, v = trimmed.tessellate(1e-3)
+    np.testing.assert_allclose(vertices, trimmed.surface(u, v), atol=1e-12)
+    p, q, r = (np.stack([u, v], axis=1)[triangles[:, i]] for i in range(3))
+    doubled = (q - p)[:, 0] * (r - p)[:, 1] - (q - p)[:, 1] * (r - p)[:, 0]
+    assert (doubled > 0).all()
+    assert 0.5 * doubled.sum() == pytest.approx(polygon_area(trimmed.loops), rel=1e-12)
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    sides, counts = np.unique(sides, axis=0, return_counts=True)
+    middle = np.asarray(trimmed.surface(*(x[sides].mean(axis=1) for x in (u, v))))
+    gap = np.linalg.norm(middle - vertices[sides].mean(axis=1), axis=1)
+    assert np.median(gap) <= 1e-3 * diagonal(vertices)
+    assert (counts <= 2).all()
+    rim = sides[counts == 1]  # which is made of closed polylines
+    assert np.bincount(rim.reshape(-1)).max() == 2
+    area = 0.5 * np.linalg.norm(
+        np.cross(*(vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))), axis=1
+    )
+    assert area.sum() == pytest.approx(float(trimmed.area()), rel=2e-3)
+
+
+def test_finer_triangles_come_closer_to_the_area():
+    trimmed = jf.TrimmedSurface(wavy_surface(9, 8), (SQUARE, *HOLES))
+    errors = []
+    for deviation in (1e-3, 1e-5):
+        mesh = trimmed.tessellate(deviation)
+        corners = mesh.vertices[mesh.triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        errors.append(abs(0.5 * np.linalg.norm(normals, axis=1).sum() - float(trimmed.area())))
+    assert errors[1] < 0.1 * errors[0]
+    assert mesh.triangles.dtype.kind == "i"
+    with pytest.raises(ValueError, match=r"deviation must be positive.*\.$"):
+        trimmed.tessellate(0.0)

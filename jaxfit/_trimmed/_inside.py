@@ -1,5 +1,7 @@
 """Which parameters are inside a set of loops: an odd number of edges is to their right."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,16 +30,34 @@ def inside_loops(
     return flat.reshape(u.shape)
 
 
+def inside_on_host(edges: Edges, points: Float[np.ndarray, "points 2"]) -> Bool[np.ndarray, " points"]:
+    """The same by NumPy, edge by edge: each looks only at the points beside it, and nothing compiles."""
+    order = np.argsort(points[:, 1], kind="stable")
+    u, v = points[order].T
+    inside = np.zeros(len(points), bool)
+    for rows, height, slope, at in _rising(edges, v):
+        inside[rows] ^= at + slope * (v[rows] - height) > u[rows]
+    result = np.empty_like(inside)
+    result[order] = inside
+    return result
+
+
 def inside_on_grid(
     edges: Edges, us: Float[np.ndarray, " a"], vs: Float[np.ndarray, " b"]
 ) -> Bool[np.ndarray, "a b"]:
-    """The same at all combinations of sorted `us` and `vs`, on the host: edge by edge, not point by point."""
+    """The same at all combinations of sorted `us` and `vs`."""
     parity = np.zeros((len(us) + 1, len(vs)), np.int64)
-    for start, end in edges:
-        (ua, va), (ub, vb) = (start, end) if start[1] < end[1] else (end, start)
-        rows = slice(*np.searchsorted(vs, (va, vb)).tolist())
-        if rows.start < rows.stop:
-            at = ua + (vs[rows] - va) * ((ub - ua) / (vb - va))
-            parity[np.searchsorted(us, at), np.arange(rows.start, rows.stop)] += 1
+    for rows, height, slope, at in _rising(edges, vs):
+        first_right = np.searchsorted(us, at + slope * (vs[rows] - height))
+        parity[first_right, np.arange(rows.start, rows.stop)] += 1
     # An edge counts for all points to its left.
     return np.cumsum(parity[::-1], axis=0)[::-1][1:] % 2 == 1
+
+
+def _rising(edges: Edges, v: Float[np.ndarray, " k"]) -> Iterator[tuple[slice, float, float, float]]:
+    """Of each edge that passes any of the sorted heights: which, its lower end (v), slope du/dv, lower u."""
+    low, high = (np.take_along_axis(edges, np.argsort(edges[:, :, 1:], axis=1), axis=1)[:, k] for k in (0, 1))
+    first, last = np.searchsorted(v, low[:, 1]), np.searchsorted(v, high[:, 1])
+    for i in np.flatnonzero(first < last).tolist():
+        slope = (high[i, 0] - low[i, 0]) / (high[i, 1] - low[i, 1])
+        yield slice(int(first[i]), int(last[i])), float(low[i, 1]), float(slope), float(low[i, 0])

@@ -12,8 +12,9 @@ from jaxfit._checks import check_kind, is_concrete
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._checked_arguments import paired_parameters
 from jaxfit._trimmed._checked_loops import Edges, Loop, checked_loops, edges_of
-from jaxfit._trimmed._inside import inside_loops
+from jaxfit._trimmed._inside import inside_loops, inside_on_host
 from jaxfit._trimmed._quadrature import quadrature
+from jaxfit._trimmed._tessellation import DEVIATION, Tessellation, tessellate
 
 
 class TrimmedSurface(eqx.Module):
@@ -83,6 +84,9 @@ class TrimmedSurface(eqx.Module):
         On a loop itself either answer may come, and NaN is outside.
         """
         u, v = paired_parameters(u, v, self.surface.knots_u)
+        if is_concrete(u, v, self.loops):
+            points = np.stack([np.asarray(u, float).reshape(-1), np.asarray(v, float).reshape(-1)], axis=1)
+            return jnp.asarray(inside_on_host(loop_edges(self), points).reshape(u.shape))
         loops = [jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1) for loop in self.loops]
         return inside_loops(jnp.concatenate(loops), u, v)
 
@@ -124,6 +128,33 @@ class TrimmedSurface(eqx.Module):
         # Zero where the normal vanishes, with a gradient of zero.
         length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
         return jnp.sum(weight * jnp.where(squared > 0, length, 0.0))
+
+    def tessellate(self, deviation: float = DEVIATION) -> Tessellation:
+        """Triangles whose sides are within `deviation` of the surface, and which follow the loops.
+
+        Parameters
+        ----------
+        deviation : float
+            The largest distance halfway along the side of a triangle, as a fraction of the diagonal of the
+            control points (default 1e-4).
+
+        Returns
+        -------
+        Tessellation
+            `vertices`, `triangles`, `u` and `v`, made by NumPy in double precision.
+
+        Raises
+        ------
+        TypeError
+            If the surface or the loops are traced: the number of triangles depends on their values.
+        ValueError
+            If `deviation` is not positive, or loops are too close to each other for triangles.
+        """
+        if not is_concrete(self):
+            raise TypeError("the trimmed surface must be known before tracing, but is traced; close over it.")
+        if not deviation > 0:
+            raise ValueError(f"deviation must be positive, but is {deviation!r}; pass for instance 1e-4.")
+        return tessellate(self.surface, host_loops(self), knot_lines(self.surface), float(deviation))
 
 
 def host_loops(trimmed: TrimmedSurface) -> list[Loop]:
