@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
-from jaxfit._cli_fit import FitOfFile, read
+from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_report import print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._fit._summary import facts
@@ -76,7 +76,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     task = FitOfFile(args, data)
     with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
         done = task.run(progress)
-    offset = io.write_surface(args.output, done.fit.surface)
+    offset = io.write_surface(args.output, fitted_surface(done.fit))
     if picture:
         from jaxfit.plot import surface_and_errors
 

@@ -29,6 +29,7 @@ ROOMS = [
     ("_batch",),
     ("io",),
     ("plot",),
+    ("_cli_methods",),
     ("_cli_arguments", "_cli_cache", "_cli_report"),
     ("_cli_session", "_cli_fit", "_cli_table", "_cli_workers"),
     ("_cli_batch_file",),

@@ -30,6 +30,7 @@ def facts(fit: Any) -> dict[str, str]:
         "iterations": str(int(fit.stats["num_steps"])),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal",
+        **_cleaning_facts(fit),
         **_trim_facts(fit),
         **_regularity_facts(fit),
         "stopped": fit.message,
@@ -53,6 +54,23 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
         f"ratio {least:.2g} to {largest:.2g}",
         "energies": energy,
     }
+
+
+_LEFT_OUT = {
+    "non_finite": "not finite",
+    "duplicates": "duplicates",
+    "outliers": "outliers",
+    "off_the_sheet": "off the sheet",
+}
+
+
+def _cleaning_facts(fit: Any) -> dict[str, str]:
+    """How many points were read, and why some were left out."""
+    counts = {name: int(fit.stats.get(key, 0)) for key, name in _LEFT_OUT.items()}
+    if "points_read" not in fit.stats:
+        return {}
+    reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
+    return {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
 
 
 def _trim_facts(fit: Any) -> dict[str, str]:
