@@ -83,6 +83,7 @@ def _add_fit(commands: Any) -> None:
     picture = fit.add_mutually_exclusive_group()
     picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
     picture.add_argument("--no-picture", action="store_true", help="draw nothing")
+    fit.add_argument("--report", metavar="FILE", help="a page of HTML: tables and pictures of the fit")
     fit.set_defaults(command="fit")
 
 

@@ -32,7 +32,7 @@ ROOMS = [
     ("_cli_methods",),
     ("_cli_arguments", "_cli_cache", "_cli_report"),
     ("_cli_session", "_cli_fit", "_cli_table", "_cli_workers"),
-    ("_cli_batch_file",),
+    ("_cli_batch_file", "_cli_page"),
     ("_cli_batch",),
     ("_cli",),
     ("__main__",),
