@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import diagonal, wavy_surface
+from scipy.interpolate import BSpline
 from surface_files import (
     FAR,
     area,
@@ -21,12 +22,13 @@ from surface_files import (
     tube,
     unclamped,
 )
-from test_trimmed_surface import LOOPS, SQUARE, circle
+from test_trimmed_surface import LOOPS, SQUARE, circle, polygon_area
 
 import jaxfit as jf
 from jaxfit._trimmed._checked_loops import edges_of
 from jaxfit._trimmed._quadrature import cut_at_lines
 from jaxfit.io import InputError, read_surface, write_surface
+from jaxfit.io._trim_curves import trim_curves
 
 
 def stretched(loops, surface):
@@ -214,3 +216,64 @@ def test_triangles_end_at_the_loops(tmp_path, suffix):
     mesh = trimesh.load_mesh(tmp_path / f"s.{suffix}")
     assert mesh.area == pytest.approx(float(trimmed.area()), rel=1e-3)
     assert mesh.euler_number == 1 - trimmed.holes
+
+
+# ----------------------------------------------------- curves in place of lines
+
+UNIT = np.array([[0.0, 1.0], [0.0, 1.0]])
+
+
+def capsule(count=300):
+    angle = np.linspace(-np.pi / 2, np.pi / 2, count)
+    half = 0.2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    right = half + np.array([0.2, 0.0])
+    return 0.5 + np.concatenate([right, -right])
+
+
+def sampled(curves):
+    points = []
+    for curve in curves:
+        spline = BSpline(curve.knots, curve.control_points, curve.degree)
+        points.append(spline(np.linspace(curve.knots[0], curve.knots[-1], 2000)[:-1]))
+    return np.concatenate(points)
+
+
+@pytest.mark.parametrize(
+    ("loop", "edges"),
+    [
+        (circle(0.5, 0.5, 0.4, 1000), 2),
+        (capsule(), 4),
+        (circle(0.5, 0.5, 0.4, 60), 60),  # whose splines would bulge
+        (LOOPS["frayed"][0], 300),
+        (SQUARE, 4),
+    ],
+)
+def test_runs_without_corners_become_splines_where_these_follow_them(loop, edges):
+    (curves,) = trim_curves([loop], UNIT)
+    assert len(curves) == edges
+    for curve, following in zip(curves, [*curves[1:], curves[0]], strict=True):
+        np.testing.assert_allclose(curve.control_points[-1], following.control_points[0], atol=1e-15)
+    points = sampled(curves)
+    assert (points >= 0).all()
+    assert (points <= 1).all()
+    area = abs(polygon_area([loop]))
+    assert abs(polygon_area([points])) == pytest.approx(area, rel=2.5e-5)
+
+
+def test_loops_whose_splines_would_touch_stay_polylines():
+    inner = circle(0.5, 0.5, 0.4, 1000)
+    loops = [circle(0.5, 0.5, 0.4, 1000), 0.5 + (inner[::-1] - 0.5) * (1 - 4e-6)]
+    assert [len(curves) for curves in trim_curves([loops[0], loops[1][::2]], UNIT)] == [1000, 500]
+
+
+@pytest.mark.parametrize("suffix", [".step", ".iges"])
+def test_open_cascade_reads_splines_as_few_edges(tmp_path, suffix):
+    need("OCP")
+    from OCP.BRepCheck import BRepCheck_Analyzer
+
+    trimmed = jf.TrimmedSurface(creased(), (circle(0.5, 0.5, 0.45, 1000), capsule() * 0.5 + 0.25))
+    write_surface(tmp_path / f"s{suffix}", trimmed)
+    shape = shape_in(tmp_path / f"s{suffix}")
+    assert BRepCheck_Analyzer(shape).IsValid()
+    assert number_of(shape, "EDGE") == 6
+    assert area_of(shape) == pytest.approx(float(trimmed.area()), rel=1e-4)

@@ -24,7 +24,7 @@ def checked_loops(loops: Sequence[Any], domain: Float[np.ndarray, "2 2"]) -> lis
         the first loop or is inside another hole.
     """
     inside = [_in_the_domain(_name(i), loop, domain) for i, loop in enumerate(loops)]
-    _check_simple(inside)
+    check_simple(inside)
     turned = [_turned(_name(i), loop, counter_clockwise=not i) for i, loop in enumerate(inside)]
     _check_holes(turned)
     return turned
@@ -89,7 +89,7 @@ def _turned(name: str, loop: Loop, counter_clockwise: bool) -> Loop:
     return loop if (area > 0) == counter_clockwise else loop[::-1]
 
 
-def _check_simple(loops: Sequence[Loop]) -> None:
+def check_simple(loops: Sequence[Loop]) -> None:
     """Raise if two edges have a point in common that is not the vertex between neighbours."""
     edges = edges_of(loops)
     counts = np.array([len(loop) for loop in loops])

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxfit._trimmed._checked_loops import Loop, signed_area
 from jaxfit.io._nets import ClampedNet
+from jaxfit.io._trim_curves import TrimCurve, trim_curves
 
 TOLERANCE = 1e-7  # of a modelling kernel, absolute
 _LEAST_DIAGONAL = 1e-4  # a thousand tolerances
@@ -16,7 +17,7 @@ _MOST_DEGREE, _MOST_SEGMENTS = 14, 1000  # of an edge in space
 def face_of(net: ClampedNet, loops: list[Loop]) -> Any:
     """The surface inside the loops as a face; without loops the whole surface, bounded by its four sides.
 
-    The edges are straight lines in (u, v), so that the face is bounded by the loops exactly.
+    Edges are those of the loops, straight in (u, v), or cubic splines through many of their vertices.
 
     Raises
     ------
@@ -81,7 +82,8 @@ def _trimmed(net: ClampedNet, loops: list[Loop]) -> Any:
     from OCP.GeomAbs import GeomAbs_Shape
 
     surface = _geometry(net)
-    wires = [_wire(surface, loop) for loop in loops]
+    apart = [_apart(surface, loop) for loop in loops]
+    wires = [_wire(surface, curves) for curves in trim_curves(apart, np.array(net.domain))]
     if any(wire is None for wire in wires):
         return None
     maker = BRepBuilderAPI_MakeFace(surface, wires[0], True)
@@ -97,27 +99,39 @@ def _trimmed(net: ClampedNet, loops: list[Loop]) -> Any:
     return face
 
 
-def _wire(surface: Any, loop: Loop) -> Any:
-    """The closed polyline of lines in (u, v), which meet in common vertices."""
+def _wire(surface: Any, curves: list[TrimCurve]) -> Any:
+    """A closed wire of edges along curves in (u, v), which meet in common vertices."""
     from OCP.BRepBuilderAPI import (
         BRepBuilderAPI_MakeEdge,
         BRepBuilderAPI_MakeVertex,
         BRepBuilderAPI_MakeWire,
     )
-    from OCP.Geom2d import Geom2d_Line
-    from OCP.gp import gp_Dir2d, gp_Pnt2d
 
-    kept = _apart(surface, loop)
-    vertices = [BRepBuilderAPI_MakeVertex(surface.Value(u, v)).Vertex() for u, v in kept.tolist()]
+    starts = [surface.Value(*curve.control_points[0].tolist()) for curve in curves]
+    vertices = [BRepBuilderAPI_MakeVertex(point).Vertex() for point in starts]
     maker = BRepBuilderAPI_MakeWire()
-    for i, along in enumerate(np.roll(kept, -1, axis=0) - kept):
-        line = Geom2d_Line(gp_Pnt2d(*kept[i].tolist()), gp_Dir2d(*along.tolist()))
+    for i, curve in enumerate(curves):
         ends = vertices[i], vertices[(i + 1) % len(vertices)]
-        edge = BRepBuilderAPI_MakeEdge(line, surface, *ends, 0.0, float(np.hypot(*along)))
+        first, last = float(curve.knots[0]), float(curve.knots[-1])
+        edge = BRepBuilderAPI_MakeEdge(_plane_curve(curve), surface, *ends, first, last)
         if not edge.IsDone():
             return None
         maker.Add(edge.Edge())
     return maker.Wire() if maker.IsDone() else None
+
+
+def _plane_curve(curve: TrimCurve) -> Any:
+    from OCP.collections import Array1_double, Array1_gp_Pnt2d, Array1_int
+    from OCP.Geom2d import Geom2d_BSplineCurve, Geom2d_Line
+    from OCP.gp import gp_Dir2d, gp_Pnt2d
+
+    points = [gp_Pnt2d(*point) for point in curve.control_points.tolist()]
+    if curve.degree == 1:
+        along = curve.control_points[1] - curve.control_points[0]
+        return Geom2d_Line(points[0], gp_Dir2d(*along.tolist()))
+    values, counts = np.unique(curve.knots, return_counts=True)
+    knots, repeats = _filled(Array1_double, values.tolist()), _filled(Array1_int, counts.tolist())
+    return Geom2d_BSplineCurve(_filled(Array1_gp_Pnt2d, points), knots, repeats, curve.degree)
 
 
 def _apart(surface: Any, loop: Loop) -> Loop:
