@@ -65,19 +65,10 @@ def test_a_cloud_is_approximated(folder, capsys):
     assert (folder / "s.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("argv", "method"),
-    [
-        ("cloud.npz --method geometric --loss huber --insertion --border corners", "GeometricApproximation"),
-        ("cloud.npz --method standard --smoothing gcv --base coons", "StandardApproximation"),
-        ("cloud.npz --method orthogonal --smoothing 1e-8 --border free", "OrthogonalDistance"),
-    ],
-)
-def test_every_method_fits_a_cloud(folder, capsys, argv, method):
-    given = [*argv.split(), *"--net 6x6 --max-steps 4 --tol-average 1 --no-picture".split()]
-    assert _cli.main(["fit", *given, "-o", "s.npz", "--report", "r.html"]) == 0
+def test_another_method_fits_a_cloud(folder, capsys):
+    argv = "fit cloud.npz --method geometric --loss huber --insertion --border corners -o s.npz".split()
+    assert _cli.main([*argv, *"--net 6x6 --max-steps 4 --tol-average 1 --no-picture".split()]) == 0
     assert shown(capsys.readouterr().out, "average error") <= 1
-    assert method in (folder / "r.html").read_text()
 
 
 @pytest.mark.parametrize("argv", ["--method interpolate-standard", "--symmetry rows"])
