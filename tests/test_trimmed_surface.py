@@ -99,6 +99,27 @@ def test_the_gradient_of_the_area_is_that_of_finite_differences():
     assert float(jax.grad(area)(0.0)) == pytest.approx(float(expected), rel=1e-6)
 
 
+def test_the_gradient_of_the_area_in_the_loops_is_that_of_finite_differences():
+    surface = wavy_surface()
+    loops = jf.TrimmedSurface(surface, LOOPS["an L with two holes"]).loops
+    rng = np.random.default_rng(0)
+    moves = [jax.numpy.asarray(rng.normal(size=loop.shape)) for loop in loops]
+
+    def area(share, lift=0.0):
+        moved = [loop + share * move for loop, move in zip(loops, moves, strict=True)]
+        net = surface.control_points.at[3, 2, 2].add(lift)
+        lifted = jf.BSplineSurface(net, surface.knots_u, surface.knots_v)
+        return jf.TrimmedSurface(lifted, moved).area()
+
+    step = 1e-6
+    slopes = jax.grad(area, argnums=(0, 1))(0.0, 0.0)
+    for k, slope in enumerate(slopes):
+        ends = [area(*(sign * step * (k == i) for i in (0, 1))) for sign in (1, -1)]
+        assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
+    with pytest.raises(TypeError, match=r"loops must be known .*without jit\."):
+        jax.jit(area)(0.0)
+
+
 def test_loops_are_turned_so_that_the_region_is_to_their_left():
     trimmed = jf.TrimmedSurface(wavy_surface(), (SQUARE[::-1], HOLES[0]))
     assert polygon_area(trimmed.loops[:1]) == 1

@@ -81,6 +81,33 @@ def cut_at_lines(
     edges: Edges, lines_u: Float[np.ndarray, " a"], lines_v: Float[np.ndarray, " b"]
 ) -> tuple[Float[np.ndarray, "pieces 2"], Float[np.ndarray, "pieces 2"]]:
     """Starts and ends of the pieces of edges between lines of constant u and of constant v, in order."""
+    i, a, b = _pieces(edges, lines_u, lines_v)
+    start, along = edges[i, 0], edges[i, 1] - edges[i, 0]
+    ends = np.where((b == 1)[:, None], edges[i, 1], start + b[:, None] * along)
+    return start + a[:, None] * along, ends
+
+
+def along_edges(
+    edges: Edges, lines_u: Float[np.ndarray, " a"], lines_v: Float[np.ndarray, " b"], count: int = _NODES
+) -> tuple[
+    Int[np.ndarray, " nodes"],
+    Float[np.ndarray, " nodes"],
+    Float[np.ndarray, "nodes 2"],
+    Float[np.ndarray, " nodes"],
+]:
+    """Nodes of Gauss's rule on the same pieces: edge, share of it, place, and weight; 1 for a whole edge."""
+    node, weight = np.polynomial.legendre.leggauss(count)
+    i, a, b = _pieces(edges, lines_u, lines_v)
+    owner = np.repeat(i, count)
+    share = (a[:, None] + (b - a)[:, None] * 0.5 * (1 + node)).reshape(-1)
+    places = edges[owner, 0] + share[:, None] * (edges[owner, 1] - edges[owner, 0])
+    return owner, share, places, ((b - a)[:, None] * 0.5 * weight).reshape(-1)
+
+
+def _pieces(
+    edges: Edges, lines_u: np.ndarray, lines_v: np.ndarray
+) -> tuple[Int[np.ndarray, " pieces"], Float[np.ndarray, " pieces"], Float[np.ndarray, " pieces"]]:
+    """Edge, and first and last share of it, of each piece between lines."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     owners, shares = [np.arange(len(edges))] * 2, [np.zeros(len(edges)), np.ones(len(edges))]
     for axis, lines in enumerate((lines_u, lines_v)):
@@ -95,9 +122,7 @@ def cut_at_lines(
     order = np.lexsort((share, owner))
     owner, share = owner[order], share[order]
     same = (owner[1:] == owner[:-1]) & (share[1:] > share[:-1])
-    i, a, b = owner[1:][same], share[:-1][same], share[1:][same]
-    ends = np.where((b == 1)[:, None], edges[i, 1], start[i] + b[:, None] * along[i])
-    return start[i] + a[:, None] * along[i], ends
+    return owner[1:][same], share[:-1][same], share[1:][same]
 
 
 def _interval_of(x: Float[np.ndarray, " k"], breaks: Float[np.ndarray, " b"]) -> Int[np.ndarray, " k"]:

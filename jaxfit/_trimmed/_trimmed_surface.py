@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 from jaxfit._checks import check_kind, is_concrete
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._checked_arguments import paired_parameters
+from jaxfit._trimmed._area import area_inside, area_of_loops, domain_of, knot_lines, on_host
 from jaxfit._trimmed._checked_loops import Edges, Loop, checked_loops, edges_of
 from jaxfit._trimmed._inside import inside_loops, inside_on_host
-from jaxfit._trimmed._quadrature import quadrature
 from jaxfit._trimmed._tessellation import DEVIATION, Tessellation, tessellate
 
 
@@ -69,7 +69,7 @@ class TrimmedSurface(eqx.Module):
         if not given:
             raise ValueError("loops must hold at least the outer loop, but is empty; give one.")
         if is_concrete(given, surface.knots_u, surface.knots_v):
-            given = list(checked_loops(given, _domain(surface)))
+            given = list(checked_loops(given, domain_of(surface)))
         self.surface = surface
         self.loops = tuple(jnp.asarray(loop, surface.control_points.dtype) for loop in given)
 
@@ -102,12 +102,13 @@ class TrimmedSurface(eqx.Module):
 
         Gauss's rule on every cell, and by Green's theorem on what remains of the cells that a loop crosses:
         loops are followed exactly. To 1e-9 and better on smooth surfaces; less where the normal nearly
-        vanishes. Differentiable in the control points.
+        vanishes. Differentiable in the control points, and by `jax.grad` in the loops, which must then
+        have the region to their left.
 
         Raises
         ------
         TypeError
-            If the loops or knots are traced: the number of nodes depends on their values.
+            If the loops or knots are traced by `jit` or `vmap`: the number of nodes depends on their values.
         ValueError
             If the surface is not in three dimensions.
         """
@@ -116,18 +117,9 @@ class TrimmedSurface(eqx.Module):
                 f"surface must be in three dimensions to have an area, but has {self.surface.dimension}; use "
                 "affine() to take it there."
             )
-        if not is_concrete(self.loops, self.surface.knots_u, self.surface.knots_v):
-            raise TypeError("loops and knots must be known before tracing, but are traced; close over them.")
-        dtype = self.surface.control_points.dtype
-        u, v, weight = (
-            jnp.asarray(x, dtype) for x in quadrature(loop_edges(self), *knot_lines(self.surface))
-        )
-        along_u = self.surface.derivative(u, v, 1, 0)
-        along_v = self.surface.derivative(u, v, 0, 1)
-        squared = jnp.sum(jnp.cross(along_u, along_v) ** 2, axis=-1)
-        # Zero where the normal vanishes, with a gradient of zero.
-        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        return jnp.sum(weight * jnp.where(squared > 0, length, 0.0))
+        if is_concrete(self.loops, self.surface.knots_u, self.surface.knots_v):
+            return area_inside(self.surface, self.loops)
+        return area_of_loops(self.surface, self.loops)
 
     def tessellate(self, deviation: float = DEVIATION) -> Tessellation:
         """Triangles whose sides are within `deviation` of the surface, and which follow the loops.
@@ -159,21 +151,9 @@ class TrimmedSurface(eqx.Module):
 
 def host_loops(trimmed: TrimmedSurface) -> list[Loop]:
     """The loops as NumPy arrays in double precision."""
-    return [np.asarray(loop, np.float64) for loop in trimmed.loops]
+    return on_host(trimmed.loops)
 
 
 def loop_edges(trimmed: TrimmedSurface) -> Edges:
     """Start and end of every edge of the loops, on the host."""
     return edges_of(host_loops(trimmed))
-
-
-def knot_lines(surface: BSplineSurface) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]]:
-    """The distinct knots in the domain along u, and along v."""
-    lines = []
-    for knots, (low, high) in zip((surface.knots_u, surface.knots_v), _domain(surface), strict=True):
-        lines.append(np.unique(np.clip(np.asarray(knots, np.float64), low, high)))
-    return lines[0], lines[1]
-
-
-def _domain(surface: BSplineSurface) -> Float[np.ndarray, "2 2"]:
-    return np.asarray(surface.domain, np.float64)

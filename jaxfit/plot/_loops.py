@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxfit._trimmed._trimmed_surface import knot_lines
+from jaxfit._trimmed._area import knot_lines
 from jaxfit.plot._picture import blank_figure, draw_loops, save
 
 if TYPE_CHECKING:
