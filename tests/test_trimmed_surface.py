@@ -1,6 +1,7 @@
 """A trimmed surface is the part of its surface inside the loops: membership, area, triangles."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -116,7 +117,7 @@ def test_the_gradient_of_the_area_in_the_loops_is_that_of_finite_differences():
     for k, slope in enumerate(slopes):
         ends = [area(*(sign * step * (k == i) for i in (0, 1))) for sign in (1, -1)]
         assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
-    with pytest.raises(TypeError, match=r"loops must be known .*without jit\."):
+    with pytest.raises(TypeError, match=r"loops must be known, .*without jit\."):
         jax.jit(area)(0.0)
 
 
@@ -155,6 +156,19 @@ def test_loops_that_bound_no_region_are_refused(loops, said):
     assert str(caught.value).endswith(".")
 
 
+def test_a_fit_tells_of_folds_only_inside_its_loops():
+    grid = np.stack(
+        [*np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 1, 7), indexing="ij"), np.zeros((8, 7))], 2
+    )
+    grid[6] = grid[4] - [0.05, 0, 0]  # folded near the last row
+    fit = jf.interpolate(grid, jf.StandardInterpolation())
+    assert "the surface folds at" in fit.message
+    left = jf.TrimmedSurface(fit.surface, (SQUARE * [0.3, 1],))
+    whole = jf.TrimmedSurface(fit.surface, (SQUARE,))
+    assert "folds" not in dataclasses.replace(fit, trimmed=left).message
+    assert re.search(r"places, [1-9]\d+ inside its loops: ", dataclasses.replace(fit, trimmed=whole).message)
+
+
 def test_a_fit_tells_its_loops_and_the_errors_inside():
     u, v = np.meshgrid(np.linspace(0, 1, 8), np.linspace(0, 1, 7), indexing="ij")
     fit = jf.interpolate(np.stack([u, v, u * v], axis=2), jf.StandardInterpolation())
@@ -163,6 +177,7 @@ def test_a_fit_tells_its_loops_and_the_errors_inside():
     trimmed = jf.TrimmedSurface(fit.surface, LOOPS["an L with two holes"])
     fit = dataclasses.replace(fit, trimmed=trimmed)
     said = str(fit)
+    assert fit.message == "all tolerances are met."
     assert "the outer one with 6 vertices, 2 holes" in said
     assert f"{int(np.asarray(fit.inside).sum())} of 56 points, average error" in said
 

@@ -84,11 +84,19 @@ def _trim_facts(fit: Any) -> dict[str, str]:
     if inside.any():
         kept = errors[inside]
         within += f", average error {kept.mean():.4g} %, maximum {kept.max():.4g} %"
-    places = fit.regularity.fold_parameters
-    if len(places):
-        within += f"; {int(np.asarray(trimmed.contains(*places.T)).sum()):,} folds"
+    if fit.regularity.folds:
+        within += f"; {_folds_inside(fit):,} folds"
     outer = len(trimmed.loops[0])
     return {"loops": f"the outer one with {outer:,} vertices, {holes}", "inside the loops": within}
+
+
+def _folds_inside(fit: Any) -> int:
+    """Folds of the surface; of a trimmed one those inside its loops, for the others are cut away."""
+    places = fit.regularity.fold_parameters
+    trimmed = getattr(fit, "trimmed", None)
+    if trimmed is None or not len(places):
+        return len(places)
+    return int(np.asarray(trimmed.contains(*places.T)).sum())
 
 
 def _samples(found: Regularity) -> str:
@@ -114,9 +122,10 @@ def with_folds(fit: Any, sentence: str) -> str:
             f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
             "this net that does not fold; insert knots, or look whether they lie on another sheet."
         )
-    if not (is_single(fit) and _is_finite(fit) and fit.regularity.folds):
+    if not (is_single(fit) and _is_finite(fit) and _folds_inside(fit)):
         return sentence
-    folds = f"the surface folds at {_places(fit.regularity)}: {_REMEDIES['method' not in fit.stats]}."
+    within = f", {_folds_inside(fit):,} inside its loops" if getattr(fit, "trimmed", None) is not None else ""
+    folds = f"the surface folds at {_places(fit.regularity)}{within}: {_REMEDIES['method' not in fit.stats]}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"
