@@ -90,6 +90,7 @@ from jaxfit._splines import clamped_uniform_knots as clamped_uniform_knots
 from jaxfit._splines import greville_abscissae as greville_abscissae
 from jaxfit._splines import insertion_matrix as insertion_matrix
 from jaxfit._splines import merge_knots as merge_knots
+from jaxfit._trimmed import TrimmedSurface as TrimmedSurface
 
 
 def __getattr__(name: str) -> object:

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
-from jaxfit._cli_fit import FitOfFile, read
+from jaxfit._cli_fit import FitOfFile, fitted_surface, read
+from jaxfit._cli_page import write_page
 from jaxfit._cli_report import print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._fit._summary import facts
@@ -76,25 +77,24 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     task = FitOfFile(args, data)
     with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
         done = task.run(progress)
-    offset = io.write_surface(args.output, done.fit.surface)
+    offset = io.write_surface(args.output, fitted_surface(done.fit))
     if picture:
         from jaxfit.plot import surface_and_errors
 
         points = data.cloud if data.grid is None else data.grid
         surface_and_errors(done.fit, points, path=picture, title=data.name)
+    read_from = {"input": args.input, "points": _describe(data)}
+    took = time.perf_counter() - started
+    outcome = {
+        "method": f"{done.method}, {'single' if args.float32 else 'double'} precision",
+        "time": f"fit {done.seconds:.2f} s, total {took:.2f} s",
+        "written": ", ".join(str(path) for path in (args.output, picture, args.report) if path),
+        **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),
+    }
+    if args.report:
+        write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        total = time.perf_counter() - started
-        print_table(
-            {
-                "input": args.input,
-                "points": _describe(data),
-                **facts(done.fit),
-                "method": f"{done.method}, {'single' if args.float32 else 'double'} precision",
-                "time": f"fit {done.seconds:.2f} s, total {total:.2f} s",
-                "written": ", ".join(str(path) for path in (args.output, picture) if path),
-                **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),
-            }
-        )
+        print_table({**read_from, **facts(done.fit), **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 
@@ -108,12 +108,14 @@ def _check_files(args: argparse.Namespace) -> str | None:
     for name in filter(None, (args.input, args.boundary)):
         if os.path.exists(name) and os.path.realpath(name) == os.path.realpath(args.output):
             raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
-    if args.no_picture:
-        return None
     drawable = importlib.util.find_spec("matplotlib") is not None
-    if not drawable and args.picture is not None:
+    if args.report:
+        io.check_output(args.report, (".html", ".htm"))
+    if args.no_picture and (drawable or not args.report):
+        return None
+    if not drawable and (args.picture is not None or args.report):
         raise io.InputError(
-            "a picture needs Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
         )
     if not drawable:
         return None

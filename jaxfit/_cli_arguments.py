@@ -6,6 +6,7 @@ import re
 from typing import Any, NoReturn
 
 from jaxfit import __version__
+from jaxfit._cli_methods import add_method_options
 from jaxfit.io import InputError
 
 _MOST_STEPS = 1_000_000  # of which the errors are kept
@@ -82,6 +83,7 @@ def _add_fit(commands: Any) -> None:
     picture = fit.add_mutually_exclusive_group()
     picture.add_argument("--picture", metavar="FILE", help="surface and errors (default: OUTPUT with .png)")
     picture.add_argument("--no-picture", action="store_true", help="draw nothing")
+    fit.add_argument("--report", metavar="FILE", help="a page of HTML: tables and pictures of the fit")
     fit.set_defaults(command="fit")
 
 
@@ -109,13 +111,7 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     """What a single fit and each of many can be told."""
     parser.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
     parser.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
-    parser.add_argument(
-        "--method",
-        choices=("auto", "interpolate", "approximate"),
-        default="auto",
-        help="auto interpolates grids of up to 40,000 points unless --net is given, and "
-        "approximates everything else",
-    )
+    add_method_options(parser)
     parser.add_argument(
         "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
     )

@@ -13,12 +13,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit import io
-from jaxfit._cli_fit import FitOfFile, read
+from jaxfit._cli_fit import FitOfFile, fitted_surface, read
+from jaxfit._cli_methods import OPTIONS as METHOD_OPTIONS
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row
 from jaxfit._precision import bucket
 
-_FIT_OPTIONS = "net order method grid boundary tol_average tol_maximum max_steps float32".split()
+_FIT_OPTIONS = (
+    *"net order method grid boundary tol_average tol_maximum max_steps float32".split(),
+    *METHOD_OPTIONS,
+)
+_FILES = ("boundary", "normals")
 _SETTINGS = "cache no_cache quiet".split()
 
 
@@ -33,12 +38,13 @@ def job_of(args: argparse.Namespace, name: str) -> Job:
     """The job of the input `name`, by absolute paths."""
     path = os.path.abspath(name)
     arguments = {key: getattr(args, key) for key in (*_FIT_OPTIONS, *_SETTINGS)}
-    for key in ("boundary", "cache"):
+    for key in (*_FILES, "cache"):
         if arguments[key] is not None:
             arguments[key] = os.path.abspath(arguments[key])
     given = {key: arguments[key] for key in _FIT_OPTIONS if arguments[key] not in (None, False)}
-    if arguments["boundary"] is not None:
-        given["boundary"] += " " + version_of(arguments["boundary"])
+    for key in _FILES:
+        if arguments[key] is not None:
+            given[key] += " " + version_of(arguments[key])
     surface = f"{Path(path).stem}.npz"
     arguments |= {"input": path, "output": os.path.abspath(os.path.join(args.output, surface))}
     row = {"input": path, "version": version_of(path), "options": json.dumps(given), "surface": surface}
@@ -80,7 +86,7 @@ def _fitted(args: argparse.Namespace) -> Row:
     data = read(args)
     done = FitOfFile(args, data).run()
     fit = done.fit
-    io.write_surface(args.output, fit.surface)
+    io.write_surface(args.output, fitted_surface(fit))
     return {
         "status": FITTED if done.reached else MISSED,
         "error": None,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jaxfit
 from jaxfit import io
 from jaxfit._checks import check_magnitude
+from jaxfit._cli_methods import asks_for_cloud, asks_for_grid, fit_options, interpolates
 
 TERRAIN = "jacksboro"
 _TERRAIN_NET = (62, 57)
@@ -31,12 +32,18 @@ def read(args: argparse.Namespace) -> io.PointData:
         data = io.jacksboro()
         if args.method == "auto":
             args.method = "approximate"
-        if args.method == "approximate" and args.net is None:
+        if not interpolates(args.method) and args.net is None:
             args.net = _TERRAIN_NET
     else:
         data = io.read_points(args.input)
         check_magnitude("points", data.cloud)
     return data if args.grid is None else data.as_grid(*args.grid)
+
+
+def fitted_surface(fit: Any) -> Any:
+    """What is written of a fit: its surface, trimmed where the fit has loops."""
+    trimmed = getattr(fit, "trimmed", None)
+    return fit.surface if trimmed is None else trimmed
 
 
 class FitOfFile:
@@ -45,12 +52,13 @@ class FitOfFile:
     def __init__(self, args: argparse.Namespace, data: io.PointData):
         self.args, self.data = args, data
         self.method = _choose_method(args, data)
-        self.boundary = _choose_boundary(args, data) if self.method == "approximate" else None
+        self.options = fit_options(args, self.method)
+        self.boundary = None if interpolates(self.method) else _choose_boundary(args, data)
 
     def run(self, progress: Any = None) -> FittedFile:
         """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""
         before = time.perf_counter()
-        fit = _fit(self.args, self.method, self.data, self.boundary, progress)
+        fit = self._fit(progress)
         average, maximum = float(fit.average_error), float(fit.maximum_error)
         seconds = time.perf_counter() - before
         if not (math.isfinite(average) and math.isfinite(maximum)):
@@ -58,9 +66,26 @@ class FitOfFile:
         reached = _reached(self.args, self.method, fit, average, maximum)
         return FittedFile(fit, self.method, average, maximum, seconds, reached)
 
+    def _fit(self, progress: Any) -> Any:
+        args, data = self.args, self.data
+        options: dict[str, Any] = {"order": args.order, "progress": progress, **self.options}
+        if args.max_steps is not None:
+            options["max_steps"] = args.max_steps
+        tolerances = {
+            name: value / 100
+            for name, value in (("tol_average", args.tol_average), ("tol_maximum", args.tol_maximum))
+            if value is not None
+        }
+        if interpolates(self.method) and data.grid is not None:
+            if tolerances:
+                # Interpolation bounds the maximum error, and with it the average.
+                options["tolerance"] = min(tolerances.values())
+            return jaxfit.interpolate(data.grid, **options)
+        return jaxfit.fit_points(data.cloud, self.boundary, net=args.net, **tolerances, **options)
+
 
 def _choose_method(args: argparse.Namespace, data: io.PointData) -> str:
-    if args.method == "interpolate":
+    if interpolates(args.method):
         if data.grid is None:
             raise io.InputError(
                 f"{args.input} holds scattered points, which cannot be interpolated; use "
@@ -73,8 +98,10 @@ def _choose_method(args: argparse.Namespace, data: io.PointData) -> str:
             )
     if args.method != "auto":
         return args.method
+    if data.grid is not None and asks_for_grid(args):
+        return "interpolate"
     small_grid = data.grid is not None and len(data.cloud) <= _LARGEST_INTERPOLATION
-    return "interpolate" if small_grid and args.net is None else "approximate"
+    return "interpolate" if small_grid and args.net is None and not asks_for_cloud(args) else "approximate"
 
 
 def _choose_boundary(args: argparse.Namespace, data: io.PointData) -> Any:
@@ -84,31 +111,11 @@ def _choose_boundary(args: argparse.Namespace, data: io.PointData) -> Any:
         return data.boundary
     if data.grid is not None:
         return jaxfit.Boundary.from_grid(data.grid)  # says what is wrong with its edges
-    raise io.InputError(
-        f"{args.input} holds scattered points without a boundary; give the four border polylines "
-        "with --boundary FILE.npz, or --grid NxM if the points make a grid."
-    )
-
-
-def _fit(args: argparse.Namespace, method: str, data: io.PointData, boundary: Any, progress: Any) -> Any:
-    options: dict[str, Any] = {"order": args.order, "progress": progress}
-    if args.max_steps is not None:
-        options["max_steps"] = args.max_steps
-    tolerances = {
-        name: value / 100
-        for name, value in (("tol_average", args.tol_average), ("tol_maximum", args.tol_maximum))
-        if value is not None
-    }
-    if method == "interpolate" and data.grid is not None:
-        if tolerances:
-            # Interpolation bounds the maximum error, and with it the average.
-            options["tolerance"] = min(tolerances.values())
-        return jaxfit.interpolate(data.grid, **options)
-    return jaxfit.fit_points(data.cloud, boundary, net=args.net, **tolerances, **options)
+    return None  # the rim of the points is found by the fit
 
 
 def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, maximum: float) -> bool:
-    if method == "interpolate" and args.tol_average is None and args.tol_maximum is None:
+    if interpolates(method) and args.tol_average is None and args.tol_maximum is None:
         return bool(fit.converged)
     # Without a requested tolerance every finite fit will do.
     return all(

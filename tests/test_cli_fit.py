@@ -65,6 +65,20 @@ def test_a_cloud_is_approximated(folder, capsys):
     assert (folder / "s.png").stat().st_size > 10_000
 
 
+def test_another_method_fits_a_cloud(folder, capsys):
+    argv = "fit cloud.npz --method geometric --loss huber --insertion --border corners -o s.npz".split()
+    assert _cli.main([*argv, *"--net 6x6 --max-steps 4 --tol-average 1 --no-picture".split()]) == 0
+    assert shown(capsys.readouterr().out, "average error") <= 1
+
+
+@pytest.mark.parametrize("argv", ["--method interpolate-standard", "--symmetry rows"])
+def test_every_method_interpolates_a_grid(folder, capsys, argv):
+    grid = wavy_grid(8, 7)
+    np.savez("even.npz", grid=0.5 * (grid + grid[::-1] * [-1, 1, 1] + [1, 0, 0]))
+    assert _cli.main(["fit", "even.npz", *argv.split(), "-o", "s.npz", "--no-picture"]) == 0
+    assert shown(capsys.readouterr().out, "maximum error") < 1e-3
+
+
 def test_a_tolerance_out_of_reach_is_told(folder):
     argv = "fit cloud.npz -o s.npz --net 5x5 --tol-maximum 1e-9 --max-steps 5 --no-picture".split()
     assert _cli.main([*argv, "--quiet"]) == 1

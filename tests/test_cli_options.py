@@ -14,7 +14,9 @@ from jaxfit.io import read_surface
 @pytest.fixture
 def fits(monkeypatch):
     """Fakes of the two ways to fit; every call is noted, with what it is to return."""
-    calls = SimpleNamespace(made=[], average=1e-5, maximum=1e-4, converged=True, fails=None)
+    calls = SimpleNamespace(
+        made=[], average=1e-5, maximum=1e-4, converged=True, fails=None, trimmed=None, stats={}
+    )
 
     def fake(name):
         def fit(data, *args, **options):
@@ -35,7 +37,10 @@ def fits(monkeypatch):
                 maximum_error=calls.maximum,
                 converged=calls.converged,
                 message="The errors are within their tolerances.",
-                stats={"num_steps": 3, "diagonal": 1.0},
+                stats={"num_steps": 3, "diagonal": 1.0, **calls.stats},
+                trimmed=calls.trimmed,
+                inside=np.full(count, True),
+                history=SimpleNamespace(average=np.full(4, 1e-5), maximum=np.full(4, 1e-4)),
             )
 
         return fit
@@ -79,6 +84,9 @@ def names(folder):
         (["cloud.npz"], "fit_points"),
         (["bare.xyz", "--grid", "10x6"], "interpolate"),
         (["bare.xyz", "--boundary", "border.npz"], "fit_points"),
+        (["bare.xyz"], "fit_points"),
+        (["grid.npz", "--loss", "huber"], "fit_points"),
+        (["grid.npz", "--method", "interpolate-standard"], "interpolate"),
     ],
 )
 def test_the_method_follows_from_the_data(fits, folder, argv, expected):
@@ -119,6 +127,76 @@ def test_options_arrive_as_fractions(fits, folder):
         "tolerance": pytest.approx(1e-4),
         "progress": None,
     }
+
+
+def test_points_without_boundary_are_fitted_without(fits, folder):
+    assert run("bare.xyz") == 0
+    _, points, arguments, options = fits.made[0]
+    assert (points.shape, arguments) == ((60, 3), (None,))
+    assert set(options) == {"order", "progress", "net"}
+
+
+@pytest.mark.parametrize(
+    ("argv", "expected"),
+    [
+        ("cloud.npz", None),
+        ("cloud.npz --method approximate", None),
+        ("cloud.npz --method orthogonal", jaxfit.OrthogonalDistance()),
+        ("cloud.npz --method geometric", jaxfit.GeometricApproximation()),
+        ("cloud.npz --method standard", jaxfit.StandardApproximation()),
+        ("cloud.npz --smoothing 1e-9", jaxfit.OrthogonalDistance(smoothing=1e-9)),
+        ("cloud.npz --smoothing regular", jaxfit.OrthogonalDistance(smoothing=jaxfit.RegularSmoothing())),
+        (
+            "cloud.npz --method standard --smoothing gcv",
+            jaxfit.StandardApproximation(smoothing=jaxfit.GeneralizedCrossValidation()),
+        ),
+        ("cloud.npz --loss huber", jaxfit.OrthogonalDistance(loss=jaxfit.Huber())),
+        ("cloud.npz --loss tukey", jaxfit.OrthogonalDistance(loss=jaxfit.Tukey())),
+        (
+            "cloud.npz --method geometric --loss geman-mcclure --insertion",
+            jaxfit.GeometricApproximation(loss=jaxfit.GemanMcClure(), insertion=jaxfit.KnotInsertion()),
+        ),
+        ("cloud.npz --border corners", jaxfit.OrthogonalDistance(border=jaxfit.FixedCorners())),
+        ("cloud.npz --border free", jaxfit.OrthogonalDistance(border=jaxfit.FreeBorder())),
+        ("grid.npz", None),
+        ("grid.npz --method interpolate-standard", jaxfit.StandardInterpolation()),
+        ("grid.npz --symmetry rows", jaxfit.GeometricInterpolation(symmetry=jaxfit.Reflection(axis=0))),
+        ("grid.npz --symmetry columns", jaxfit.GeometricInterpolation(symmetry=jaxfit.Reflection(axis=1))),
+    ],
+)
+def test_options_are_fields_of_the_method(fits, folder, argv, expected):
+    assert run(*argv.split()) in (0, 1)
+    assert repr(fits.made[0][3].get("method")) == repr(expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("coons", jaxfit.Coons), ("meshless", jaxfit.Meshless), ("dynamic", jaxfit.DynamicBaseSurface)],
+)
+def test_the_base_is_chosen(fits, folder, name, expected):
+    assert run("cloud.npz", "--base", name) == 0
+    assert isinstance(fits.made[0][3]["base"], expected)
+    assert fits.made[0][3].get("method") is None
+
+
+def test_normals_are_read(fits, folder):
+    normals = np.random.default_rng(0).normal(size=(8, 7, 3))
+    np.savez("normals.npz", normals=normals)
+    np.save("normals.npy", normals)
+    for i, name in enumerate(("normals.npz", "normals.npy")):
+        assert run("grid.npz", "--normals", name) in (0, 1)
+        np.testing.assert_array_equal(fits.made[i][3]["normals"], normals)
+
+
+def test_a_trimmed_fit_is_written_with_its_loops_and_its_counts_are_shown(fits, folder, capsys):
+    loop = np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.9]])
+    fits.trimmed = jaxfit.TrimmedSurface(wavy_surface(), (loop,))
+    fits.stats = {"points_read": 70, "duplicates": 4, "outliers": 6, "non_finite": 0, "off_the_sheet": 0}
+    assert run("bare.xyz") == 0
+    assert isinstance(read_surface("s.npz"), jaxfit.TrimmedSurface)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "70; left out: 4 duplicates, 6 outliers" in said
+    assert "the outer one with 3 vertices, no hole" in said
 
 
 def test_the_surface_is_written(fits, folder):
@@ -176,7 +254,6 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "-o", "s.npz"], "INPUT"),
         (["draw", "cloud.npz"], "'draw'"),
         (["fit", "none.npz", "-o", "s.npz"], "none.npz does not exist"),
-        (["fit", "bare.xyz", "-o", "s.npz"], "without a boundary; give"),
         (["fit", "bare.xyz", "-o", "s.npz", "--method", "interpolate"], "cannot be interpolated"),
         (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "7 x 7 grid of 49"),
         (["fit", "bare.xyz", "-o", "s.npz", "--boundary", "grid.npz"], "holds no boundary"),
@@ -191,6 +268,22 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "cloud.npz", "-o", "s.npz", "--tol-maximum", "nan"], "'nan' is no percentage"),
         (["fit", "cloud.npz", "-o", "s.npz", "--max-steps", "0"], "'0' is no number of steps"),
         (["fit", "cloud.npz", "-o", "s.npz", "--method", "guess"], "'guess'"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--smoothing", "-1"], "'-1' is neither a number"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--smoothing", "gcv"], "is one of --method standard"),
+        (
+            ["fit", "cloud.npz", "-o", "s.npz", "--smoothing", "1", "--method", "geometric"],
+            "--smoothing is no option of --method geometric",
+        ),
+        (["fit", "cloud.npz", "-o", "s.npz", "--symmetry", "rows"], "--symmetry is no option of"),
+        (
+            ["fit", "grid.npz", "-o", "s.npz", "--loss", "huber", "--method", "interpolate"],
+            "--loss is no option of --method interpolate; leave it out, or use --method approximate",
+        ),
+        (["fit", "grid.npz", "-o", "s.npz", "--normals", "grid.npz"], "holds no normals"),
+        (
+            ["fit", "grid.npz", "-o", "s.npz", "--normals", "n.npy", "--symmetry", "rows"],
+            "--normals has a method of its own",
+        ),
     ],
 )
 def test_bad_usage_is_one_sentence(fits, folder, capsys, argv, said):

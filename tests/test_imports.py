@@ -22,15 +22,17 @@ ROOMS = [
     ("_normal_equations",),
     ("_base",),
     ("_quality",),
+    ("_trimmed",),
     ("_fit",),
     ("_interpolation",),
     ("_approximation",),
     ("_batch",),
     ("io",),
     ("plot",),
+    ("_cli_methods",),
     ("_cli_arguments", "_cli_cache", "_cli_report"),
     ("_cli_session", "_cli_fit", "_cli_table", "_cli_workers"),
-    ("_cli_batch_file",),
+    ("_cli_batch_file", "_cli_page"),
     ("_cli_batch",),
     ("_cli",),
     ("__main__",),
@@ -102,7 +104,7 @@ import jaxfit, jaxfit.io
 assert not jax.live_arrays(), jax.live_arrays()
 heavy = {"matplotlib", "jaxopt", "optimistix", "scipy.spatial", "scipy.interpolate", "rich"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
-extra = {"OCP", "rhino3dm", "trimesh", "laspy", "lazrs", "pye57", "pypcd4"}
+extra = {"OCP", "rhino3dm", "trimesh", "laspy", "lazrs", "pye57", "pypcd4", "shapely"}
 assert not extra & set(sys.modules), extra & set(sys.modules)
 assert dict(jax.config.values) == before
 """

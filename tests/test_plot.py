@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers import wavy_surface
-from scipy.ndimage import binary_fill_holes
+from scipy.ndimage import binary_fill_holes, label
+from test_trimmed_surface import LOOPS
 
 import jaxfit as jf
-from jaxfit.plot import surface_and_errors, zebra_stripes
+from jaxfit.plot import history, loops, surface_and_errors, zebra_stripes
 from jaxfit.plot._render import render
 from jaxfit.plot._view import choose_view
 
@@ -169,3 +170,56 @@ def test_zebra_stripes_stand_below_the_shaded_surfaces():
     seen = (np.asarray(figure.axes[i].images[0].get_array()) for i in (0, 2))
     shaded, striped = (image[image[..., 3] > 0.99][:, :3] for image in seen)
     assert np.std(striped) > 2 * np.std(shaded)
+
+
+# ---------------------------------------------------------------------- trims
+
+
+def trimmed_fit(count=500, surface=None):
+    fit = fake_fit((count,), surface)
+    fit.trimmed = jf.TrimmedSurface(fit.surface, LOOPS["an L with two holes"])
+    fit.inside = fit.trimmed.contains(fit.u, fit.v)
+    return fit
+
+
+def test_only_the_inside_of_the_loops_is_drawn():
+    for striped in (False, True):
+        trimmed = trimmed_fit().trimmed
+        figure = zebra_stripes(trimmed, shaded=True)
+        opaque = np.asarray(figure.axes[int(striped)].images[0].get_array())[..., 3] > 0.5
+        pieces, _ = label(~opaque)
+        sizes = np.bincount(pieces.reshape(-1))[1:]
+        assert (sizes > 200).sum() == 1 + trimmed.holes  # what is around, and each hole
+        assert label(opaque)[1] == 1
+
+
+def test_errors_and_folds_are_those_inside_the_loops():
+    fit = trimmed_fit()
+    figure = surface_and_errors(fit)
+    inside = np.asarray(fit.inside)
+    axes = figure.axes[1]
+    assert len(axes.collections[0].get_offsets()) == inside.sum() < 500
+    np.testing.assert_array_equal(axes.lines[1].get_xydata()[:-1], fit.trimmed.loops[1])
+    within = 100 * fit.errors[inside]
+    title = axes.get_title()
+    assert f"inside the loops: average {within.mean():.3g} %, maximum {within.max():.3g} %" in title
+    assert f"all 500 points: average {100 * fit.average_error:.3g} %" in title
+    folded = trimmed_fit(surface=with_points(lambda p: p + 0.9 * np.eye(7)[3][:, None, None] * np.eye(3)[0]))
+    places = folded.regularity.fold_parameters
+    count = int(np.asarray(folded.trimmed.contains(*places.T)).sum())
+    assert 0 < count < len(places)
+    assert f"{count:,} folds" in surface_and_errors(folded).axes[0].get_title()
+
+
+def test_loops_and_history_are_drawn(tmp_path):
+    fit = trimmed_fit()
+    axes = loops(fit, tmp_path / "l.png").axes[0]
+    said = [text.get_text() for text in axes.get_legend().get_texts()]
+    inside = int(np.asarray(fit.inside).sum())
+    assert said == [f"{inside} points inside", f"{500 - inside} points outside"]
+    errors = np.array([1e-2, 1e-3, 1e-4])
+    fit.history = SimpleNamespace(average=errors, maximum=3 * errors)
+    fit.stats["num_steps"] = 2
+    axes = history(fit, tmp_path / "h.png").axes[0]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), 300 * errors)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["h.png", "l.png"]

@@ -5,9 +5,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._history import History
@@ -15,6 +16,7 @@ from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._summary import describe, describe_briefly, with_folds
 from jaxfit._quality import Regularity, regularity
 from jaxfit._splines import BSplineSurface
+from jaxfit._trimmed import TrimmedSurface
 
 
 @jax.tree_util.register_static
@@ -49,6 +51,9 @@ class Fit(eqx.Module):
         interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
         Methods add further entries, which their docstrings describe.
+    trimmed : TrimmedSurface or None
+        The surface cut to the sheet of the points, where the fit has found its rim and holes; `surface` is
+        larger. `inside` says which points lie within.
 
     Examples
     --------
@@ -69,6 +74,7 @@ class Fit(eqx.Module):
     history: History
     result: Any
     stats: dict[str, Any]
+    trimmed: TrimmedSurface | None = None
 
     def __str__(self) -> str:
         return describe(self)
@@ -80,6 +86,13 @@ class Fit(eqx.Module):
     def converged(self) -> Any:
         """Whether all tolerances are met."""
         return self.result == RESULTS.converged
+
+    @property
+    def inside(self) -> Bool[Array, "..."]:
+        """Which points have their foot inside the loops of `trimmed`: all, where there are none."""
+        if self.trimmed is None:
+            return jnp.ones(jnp.shape(self.errors), bool)
+        return self.trimmed.contains(self.u, self.v)
 
     @cached_property
     def regularity(self) -> Regularity:

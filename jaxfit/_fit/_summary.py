@@ -30,6 +30,8 @@ def facts(fit: Any) -> dict[str, str]:
         "iterations": str(int(fit.stats["num_steps"])),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal",
+        **_cleaning_facts(fit),
+        **_trim_facts(fit),
         **_regularity_facts(fit),
         "stopped": fit.message,
     }
@@ -52,6 +54,49 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
         f"ratio {least:.2g} to {largest:.2g}",
         "energies": energy,
     }
+
+
+_LEFT_OUT = {
+    "non_finite": "not finite",
+    "duplicates": "duplicates",
+    "outliers": "outliers",
+    "off_the_sheet": "off the sheet",
+}
+
+
+def _cleaning_facts(fit: Any) -> dict[str, str]:
+    """How many points were read, and why some were left out."""
+    counts = {name: int(fit.stats.get(key, 0)) for key, name in _LEFT_OUT.items()}
+    if "points_read" not in fit.stats:
+        return {}
+    reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
+    return {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
+
+
+def _trim_facts(fit: Any) -> dict[str, str]:
+    """The loops, and the errors of the points inside them."""
+    trimmed = getattr(fit, "trimmed", None)
+    if trimmed is None or not _is_finite(fit):
+        return {}
+    holes = {0: "no hole", 1: "one hole"}.get(trimmed.holes, f"{trimmed.holes:,} holes")
+    inside, errors = np.asarray(fit.inside), 100 * np.asarray(fit.errors, float)
+    within = f"{int(inside.sum()):,} of {inside.size:,} points"
+    if inside.any():
+        kept = errors[inside]
+        within += f", average error {kept.mean():.4g} %, maximum {kept.max():.4g} %"
+    if fit.regularity.folds:
+        within += f"; {_folds_inside(fit):,} folds"
+    outer = len(trimmed.loops[0])
+    return {"loops": f"the outer one with {outer:,} vertices, {holes}", "inside the loops": within}
+
+
+def _folds_inside(fit: Any) -> int:
+    """Folds of the surface; of a trimmed one those inside its loops, for the others are cut away."""
+    places = fit.regularity.fold_parameters
+    trimmed = getattr(fit, "trimmed", None)
+    if trimmed is None or not len(places):
+        return len(places)
+    return int(np.asarray(trimmed.contains(*places.T)).sum())
 
 
 def _samples(found: Regularity) -> str:
@@ -77,9 +122,10 @@ def with_folds(fit: Any, sentence: str) -> str:
             f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
             "this net that does not fold; insert knots, or look whether they lie on another sheet."
         )
-    if not (is_single(fit) and _is_finite(fit) and fit.regularity.folds):
+    if not (is_single(fit) and _is_finite(fit) and _folds_inside(fit)):
         return sentence
-    folds = f"the surface folds at {_places(fit.regularity)}: {_REMEDIES['method' not in fit.stats]}."
+    within = f", {_folds_inside(fit):,} inside its loops" if getattr(fit, "trimmed", None) is not None else ""
+    folds = f"the surface folds at {_places(fit.regularity)}{within}: {_REMEDIES['method' not in fit.stats]}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"
@@ -94,7 +140,7 @@ def describe(fit: "Fit") -> str:
     if not is_single(fit):
         return eqx.tree_pformat(fit)
     rows = {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)}
-    return "\n".join(f"{name:<17}{value}" for name, value in rows.items())
+    return "\n".join(f"{name:<18}{value}" for name, value in rows.items())
 
 
 def describe_briefly(fit: "Fit") -> str:

@@ -1,21 +1,17 @@
-"""STEP and IGES through Open CASCADE: no other file knows of it."""
+"""STEP and IGES through Open CASCADE: only this file and `_cad_face` know of it."""
 
 import contextlib
 import io
 import textwrap
 from collections.abc import Iterator
-from typing import Any
 
-import numpy as np
-
+from jaxfit._trimmed._checked_loops import Loop
+from jaxfit.io._cad_face import face_of
 from jaxfit.io._nets import ClampedNet
 
-_TOLERANCE = 1e-7  # of a modelling kernel, absolute
-_LEAST_DIAGONAL = 1e-4  # a thousand tolerances
 
-
-def step_file(net: ClampedNet, name: str, note: str) -> bytes:
-    """The surface as one face in a STEP file (AP214, millimetres).
+def step_file(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
+    """The surface, or its part inside the loops, as one face in a STEP file (AP214, millimetres).
 
     Raises
     ------
@@ -34,7 +30,7 @@ def step_file(net: ClampedNet, name: str, note: str) -> bytes:
     buffer = io.BytesIO()
     with _quiet():
         writer = STEPControl_Writer()
-        status = writer.Transfer(_face(net), STEPControl_StepModelType.STEPControl_AsIs)
+        status = writer.Transfer(face_of(net, loops), STEPControl_StepModelType.STEPControl_AsIs)
         if status == IFSelect_ReturnStatus.IFSelect_RetDone:
             model = writer.Model()
             for i in range(1, model.NbEntities() + 1):
@@ -54,8 +50,8 @@ def step_file(net: ClampedNet, name: str, note: str) -> bytes:
     return buffer.getvalue()
 
 
-def iges_file(net: ClampedNet, name: str, note: str) -> bytes:
-    """The surface as one trimmed surface (entity 144) in an IGES file (millimetres).
+def iges_file(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
+    """The same as one trimmed surface (entity 144) in an IGES file (millimetres).
 
     Raises as `step_file`.
     """
@@ -66,7 +62,7 @@ def iges_file(net: ClampedNet, name: str, note: str) -> bytes:
     buffer = io.BytesIO()
     with _quiet():
         writer = IGESControl_Writer("MM", 0)
-        made = writer.AddShape(_face(net))
+        made = writer.AddShape(face_of(net, loops))
         writer.ComputeModel()
         model = writer.Model()
         for line in textwrap.wrap(_ascii(f"{name}: {note}"), 72):
@@ -78,49 +74,6 @@ def iges_file(net: ClampedNet, name: str, note: str) -> bytes:
     if not made:
         raise OSError(f"the IGES file of {name} could not be made; write .3dm or .json.")
     return buffer.getvalue()
-
-
-def _face(net: ClampedNet) -> Any:
-    """The whole surface as a face, bounded by its four sides."""
-    from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeFace
-    from OCP.BRepCheck import BRepCheck_Analyzer
-
-    if not net.diagonal >= _LEAST_DIAGONAL:
-        raise ValueError(
-            f"surface must be at least {_LEAST_DIAGONAL:g} across for STEP and IGES, whose readers take "
-            f"points closer than {_TOLERANCE:g} for one, but is {net.diagonal:.3g}; use a smaller unit."
-        )
-    maker = BRepBuilderAPI_MakeFace(_geometry(net), _TOLERANCE)
-    if not (maker.IsDone() and BRepCheck_Analyzer(maker.Face()).IsValid()):
-        raise ValueError(
-            "surface must make a valid face, but Open CASCADE finds that it does not; write .3dm or .json."
-        )
-    return maker.Face()
-
-
-def _geometry(net: ClampedNet) -> Any:
-    from OCP.collections import Array1_double, Array1_int, Array2_gp_Pnt
-    from OCP.Geom import Geom_BSplineSurface
-    from OCP.gp import gp_Pnt
-
-    nu, nv, _ = net.control_points.shape
-    points = Array2_gp_Pnt(1, nu, 1, nv)
-    for i, row in enumerate(net.control_points.tolist(), start=1):
-        for j, point in enumerate(row, start=1):
-            points.SetValue(i, j, gp_Pnt(*point))
-    knots, repeats = [], []
-    for vector in (net.knots_u, net.knots_v):
-        values, counts = np.unique(vector, return_counts=True)
-        knots.append(_filled(Array1_double, values.tolist()))
-        repeats.append(_filled(Array1_int, counts.tolist()))
-    return Geom_BSplineSurface(points, *knots, *repeats, *(order - 1 for order in net.order))
-
-
-def _filled(kind: Any, values: list[Any]) -> Any:
-    array = kind(1, len(values))
-    for i, value in enumerate(values, start=1):
-        array.SetValue(i, value)
-    return array
 
 
 @contextlib.contextmanager

@@ -23,6 +23,12 @@ class ClampedNet(NamedTuple):
         """That of the bounding box of the control points."""
         return float(np.linalg.norm(np.ptp(self.control_points, axis=(0, 1))))
 
+    @property
+    def domain(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """First and last parameter along u, and along v."""
+        u, v = self.knots_u, self.knots_v
+        return (float(u[0]), float(u[-1])), (float(v[0]), float(v[-1]))
+
 
 def clamped_net(surface: BSplineSurface) -> ClampedNet:
     """The same surface on clamped knots, without control points that have no influence.

@@ -1,46 +1,50 @@
-"""Surfaces in files: NumPy's .npz, geomdl's exchange JSON, and what other programs read."""
+"""Surfaces in files: the lossless formats, and what other programs read."""
 
-import io
-import json
 import os
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxfit._checks import check_kind
 from jaxfit._fit import Fit
 from jaxfit._splines import BSplineSurface
-from jaxfit.io._arrays import load_arrays
+from jaxfit._trimmed import TrimmedSurface
+from jaxfit._trimmed._trimmed_surface import host_loops
 from jaxfit.io._cad import iges_file, step_file
 from jaxfit.io._nets import clamped_net, near_origin
 from jaxfit.io._output import check_output, write_atomically
 from jaxfit.io._point_data import InputError
 from jaxfit.io._points import check_input
 from jaxfit.io._rhino import rhino_file
-from jaxfit.io._tessellation import mesh_file
+from jaxfit.io._stored import json_file, npz_file, stored_surface
+from jaxfit.io._tessellation import mesh_file, tessellate
 
-_KEYS = ("control_points", "knots_u", "knots_v")
 # What a parser raises on damaged files, and what a surface that is none raises.
 _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, RecursionError)
 
 
-def write_surface(path: str | os.PathLike, surface: BSplineSurface | Fit) -> Float[np.ndarray, " d"]:
-    """Write a surface, or that of a fit; the file appears whole or not at all, and replaces an older one.
+def write_surface(
+    path: str | os.PathLike, surface: BSplineSurface | TrimmedSurface | Fit
+) -> Float[np.ndarray, " d"]:
+    """Write a surface, trimmed or not, or that of a fit; the file appears whole or not at all.
 
     ==================  ===========================================================
     suffix              content
     ==================  ===========================================================
     ``.npz``            arrays ``control_points`` (nu, nv, d), ``knots_u``,
                         ``knots_v`` and ``order`` (2,), in the surface's own
-                        precision
+                        precision; of loops ``loop_vertices`` (k, 2), one after
+                        another, and ``loop_counts``, how many each has
     ``.json``           geomdl's exchange format (``geomdl.exchange.import_json``);
-                        geomdl scales knots to [0, 1] when it reads them
-    ``.step``, ``.stp`` one face of a B-spline surface, AP214 (OCP)
-    ``.iges``, ``.igs`` one trimmed surface, which is the whole surface (OCP)
-    ``.3dm``            Rhino's format, exact, without a unit (rhino3dm)
+                        geomdl scales knots to [0, 1] when it reads them; loops
+                        are freeform trims, in the knots of the file
+    ``.step``, ``.stp`` one face of a B-spline surface, AP214 (OCP), whose edges
+                        are the loops
+    ``.iges``, ``.igs`` one trimmed surface (OCP), by default the whole surface
+    ``.3dm``            Rhino's format, exact, without a unit (rhino3dm); loops
+                        are curves beside the whole surface
     ``.ply``, ``.stl``  triangles within 0.01 % of the diagonal, ``.ply`` and
     ``.obj``            ``.stl`` in single precision (trimesh)
     ==================  ===========================================================
@@ -53,7 +57,7 @@ def write_surface(path: str | os.PathLike, surface: BSplineSurface | Fit) -> Flo
     path
         The file; its suffix chooses the format.
     surface
-        The surface, or a `jaxfit.Fit`.
+        The surface, or a `jaxfit.Fit`, of which `trimmed` is written if it has one.
 
     Returns
     -------
@@ -68,7 +72,7 @@ def write_surface(path: str | os.PathLike, surface: BSplineSurface | Fit) -> Flo
     InputError
         If the path cannot be written, or a library is not installed (see `check_output`).
     TypeError
-        If `surface` is neither a surface nor a fit.
+        If `surface` is neither a surface nor a trimmed one nor a fit.
     ValueError
         If the surface has control points that are not finite, or is none that the format can hold: not in
         three dimensions, with a jump, or too small for STEP and IGES (less than 1e-4 across).
@@ -88,46 +92,53 @@ def write_surface(path: str | os.PathLike, surface: BSplineSurface | Fit) -> Flo
     [0.5, 0.5, 0.25]
     """
     check_output(path)
-    surface = surface.surface if isinstance(surface, Fit) else surface
-    check_kind("surface", surface, BSplineSurface, "fit.surface")
-    if not np.isfinite(np.asarray(surface.control_points)).all():
+    if isinstance(surface, Fit):
+        surface = surface.surface if surface.trimmed is None else surface.trimmed
+    trimmed = surface if isinstance(surface, TrimmedSurface) else None
+    whole: Any = surface if trimmed is None else trimmed.surface
+    check_kind("surface", whole, BSplineSurface, "fit.surface")
+    if not np.isfinite(np.asarray(whole.control_points)).all():
         raise ValueError(
             "surface must have finite control points, but some are NaN or infinite; do not "
             "write a fit that failed."
         )
-    content, offset = _content(Path(path), surface)
+    content, offset = _content(Path(path), whole, trimmed)
     write_atomically(path, content)
     return offset
 
 
-def _content(path: Path, surface: BSplineSurface) -> tuple[bytes, np.ndarray]:
+def _content(path: Path, surface: BSplineSurface, trimmed: TrimmedSurface | None) -> tuple[bytes, np.ndarray]:
     """The bytes of the file, and the offset that was subtracted."""
     suffix, nowhere = path.suffix.lower(), np.zeros(surface.dimension)
     if suffix == ".npz":
-        return _npz(surface), nowhere
+        return npz_file(surface, trimmed), nowhere
     if suffix == ".json":
-        return json.dumps(_geomdl(surface), separators=(",", ":")).encode(), nowhere
+        return json_file(surface, trimmed), nowhere
     net = clamped_net(surface)
+    loops = [] if trimmed is None else host_loops(trimmed)
     if suffix == ".3dm":
-        return rhino_file(net, path.stem), nowhere
-    net, offset = near_origin(net)
+        return rhino_file(net, loops, path.stem), nowhere
+    centred, offset = near_origin(net)
     note = "written by jaxfit"
     if offset.any():
         note += "; add to coordinates: " + " ".join(map(repr, offset.tolist()))
     if suffix in (".step", ".stp"):
-        return step_file(net, path.stem, note), offset
+        return step_file(centred, loops, path.stem, note), offset
     if suffix in (".iges", ".igs"):
-        return iges_file(net, path.stem, note), offset
-    return mesh_file(net, suffix, note), offset
+        return iges_file(centred, loops, path.stem, note), offset
+    if trimmed is None:
+        return mesh_file(*tessellate(centred), suffix, note), offset
+    vertices, triangles, *_ = trimmed.tessellate()
+    return mesh_file(vertices - offset, triangles, suffix, note), offset
 
 
-def read_surface(path: str | os.PathLike) -> BSplineSurface:
+def read_surface(path: str | os.PathLike) -> BSplineSurface | TrimmedSurface:
     """Read a surface that `write_surface` or geomdl's ``export_json`` wrote.
 
     Returns
     -------
-    BSplineSurface
-        In JAX's default precision.
+    BSplineSurface or TrimmedSurface
+        In JAX's default precision; trimmed if the file holds loops.
 
     Raises
     ------
@@ -137,12 +148,7 @@ def read_surface(path: str | os.PathLike) -> BSplineSurface:
     path = Path(path)
     check_input(path, (".npz", ".json"))
     try:
-        if path.suffix.lower() == ".json":
-            arrays = _from_geomdl(json.loads(path.read_text(encoding="utf-8")), path)
-        else:
-            found = load_arrays(path, _KEYS)[0]
-            arrays = [found[key] for key in _KEYS]
-        return BSplineSurface(*(jnp.asarray(x, jnp.result_type(float)) for x in arrays))
+        return stored_surface(path)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
     except InputError:
@@ -152,49 +158,6 @@ def read_surface(path: str | os.PathLike) -> BSplineSurface:
             f"{path} holds no B-spline surface that can be read ({_one_line(error)}); write it "
             "with jaxfit.io.write_surface."
         ) from error
-
-
-def _npz(surface: BSplineSurface) -> bytes:
-    buffer = io.BytesIO()
-    arrays = {key: np.asarray(getattr(surface, key)) for key in _KEYS}
-    np.savez(buffer, **arrays, order=np.asarray(surface.order))  # type: ignore[arg-type]
-    return buffer.getvalue()
-
-
-def _geomdl(surface: BSplineSurface) -> dict[str, Any]:
-    control_points, knots_u, knots_v = (np.asarray(getattr(surface, key)) for key in _KEYS)
-    nu, nv, d = control_points.shape
-    document = {
-        "type": "spline",
-        "rational": False,
-        "dimension": d,
-        "degree_u": len(knots_u) - nu - 1,
-        "degree_v": len(knots_v) - nv - 1,
-        "knotvector_u": knots_u.tolist(),
-        "knotvector_v": knots_v.tolist(),
-        "size_u": nu,
-        "size_v": nv,
-        # geomdl lets v run fastest, as C order does.
-        "control_points": {"points": control_points.reshape(-1, d).tolist()},
-        "delta": [0.05, 0.05],
-    }
-    return {"shape": {"type": "surface", "count": 1, "data": [document]}}
-
-
-def _from_geomdl(document: dict[str, Any], path: Path) -> list[np.ndarray]:
-    shape = document["shape"]
-    if shape["type"] != "surface" or len(shape["data"]) != 1:
-        raise InputError(
-            f"{path} holds {len(shape['data'])} x {shape['type']}; keep exactly one surface in it."
-        )
-    surface = shape["data"][0]
-    weights = np.asarray(surface["control_points"].get("weights", 1.0))
-    if np.ptp(weights):
-        raise InputError(f"{path} holds a rational surface; only surfaces with equal weights can be read.")
-    points = np.asarray(surface["control_points"]["points"], dtype=float)
-    control_points = points.reshape(surface["size_u"], surface["size_v"], -1)
-    knots = [np.asarray(surface[f"knotvector_{which}"], dtype=float) for which in "uv"]
-    return [control_points, *knots]
 
 
 def _one_line(error: Exception) -> str:

@@ -17,8 +17,8 @@ Vertices = Float[np.ndarray, "vertices 3"]
 Triangles = Int[np.ndarray, "triangles 3"]
 
 
-def mesh_file(net: ClampedNet, suffix: str, note: str) -> bytes:
-    """The triangles of `tessellate` in a .ply, .stl or .obj file.
+def mesh_file(vertices: Vertices, triangles: Triangles, suffix: str, note: str) -> bytes:
+    """Triangles in a .ply, .stl or .obj file.
 
     Raises
     ------
@@ -26,13 +26,13 @@ def mesh_file(net: ClampedNet, suffix: str, note: str) -> bytes:
         If the surface has no area.
     """
     trimesh: Any = importlib.import_module("trimesh")
-    vertices, triangles = tessellate(net)
     if not len(triangles):
         raise ValueError("surface must have an area to be written as triangles, but has none; write .json.")
     mesh = trimesh.Trimesh(vertices, triangles, process=False)
     comment = note.encode("ascii", "replace")
     if suffix == ".obj":
-        digits = int(np.clip(np.ceil(10 - np.log10(net.diagonal)), 0, 300))  # after the decimal point
+        diagonal = np.linalg.norm(np.ptp(vertices, axis=0))
+        digits = int(np.clip(np.ceil(10 - np.log10(diagonal)), 0, 300))  # after the decimal point
         text: str = mesh.export(file_type="obj", digits=digits, include_normals=False, header=note)
         return text.encode()
     content: bytes = mesh.export(file_type=suffix[1:])

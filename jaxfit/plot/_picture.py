@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfit._trimmed import TrimmedSurface
+from jaxfit._trimmed._trimmed_surface import host_loops
 from jaxfit.io._output import write_atomically
+from jaxfit.plot._part import folds_in, of_fit
 from jaxfit.plot._render import render
 from jaxfit.plot._view import View
 
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
 _LARGEST_SCATTER = 20_000  # points; more are drawn as a raster
 _COLOURS = "inferno"
 _FOLDS = "deepskyblue"  # which the colours of errors are not
+_LOOP = "tab:blue"
 
 
 def surface_and_errors(
@@ -37,7 +41,9 @@ def surface_and_errors(
     not hide the rest. Of more than 20,000 scattered points every cell of a raster shows its
     largest error. Folds of the surface (`fit.regularity`) are red on the left and crosses on the
     right; the caption counts them. It has the smallest angle between parameter lines and the
-    thin-plate energy in squared diagonals, too. Neither pyplot nor a backend is touched.
+    thin-plate energy in squared diagonals, too. Of a fit with loops (`fit.trimmed`) both sides show what is
+    inside them, and the loops; the caption has the errors inside and of all points. Neither pyplot nor a
+    backend is touched.
 
     Parameters
     ----------
@@ -90,7 +96,8 @@ def _arrange(errors: ArrayLike, points: ArrayLike | None) -> np.ndarray:
 
 
 def _draw_surface(axes: "Axes", fit: Any) -> View:
-    image, view = render(fit.surface, folds=fit.regularity.fold_parameters)
+    part = of_fit(fit)
+    image, view = render(part, folds=folds_in(part, fit.regularity))
     axes.imshow(image)
     axes.set_axis_off()
     axes.set_title(_caption(fit, view), fontsize=11)
@@ -98,8 +105,9 @@ def _draw_surface(axes: "Axes", fit: Any) -> View:
 
 
 def _caption(fit: Any, view: View) -> str:
-    found = fit.regularity
-    folds = {0: "no folds", 1: "1 fold"}.get(found.folds, f"{found.folds:,} folds")
+    found, part = fit.regularity, of_fit(fit)
+    count = len(folds_in(part, found))
+    folds = {0: "no folds", 1: "1 fold"}.get(count, f"{count:,} folds")
     caption = "{} \N{MULTIPLICATION SIGN} {} control points, {}".format(*fit.surface.shape, folds)
     if view.factor > 1:
         caption += f", {view.relief} stretched {view.factor} times"
@@ -111,11 +119,16 @@ def _caption(fit: Any, view: View) -> str:
 
 
 def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None:
-    top = float(np.percentile(errors, 99.5)) or 1.0
+    trimmed = getattr(fit, "trimmed", None)
+    inside = np.ones(errors.size, bool) if trimmed is None else np.asarray(fit.inside).reshape(-1)
+    if trimmed is not None:
+        errors = errors.reshape(-1)[inside]  # of a grid, too: loops are drawn over parameters
+    top = float(np.percentile(errors, 99.5)) if errors.size else 0.0
+    top = top or 1.0
     drawn: Any
     style: dict[str, Any] = {"cmap": _COLOURS, "vmin": 0.0, "vmax": top}
     label = "error, % of the diagonal"
-    u, v = (np.asarray(x, dtype=float).ravel() for x in (fit.u, fit.v))
+    u, v = (np.asarray(x, dtype=float).ravel()[inside] for x in (fit.u, fit.v))
     if errors.ndim == 2:
         drawn = axes.imshow(errors.T, origin="lower", aspect="auto", **style)
         axes.set_xlabel("row of the grid (along u)")
@@ -129,9 +142,10 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
             drawn = axes.pcolormesh(edges_u, edges_v, raster.T, **style)
             label = "largest error per cell, % of the diagonal"
         else:
-            size = np.clip(7e4 / errors.size, 1.5, 60.0)
+            size = np.clip(7e4 / max(errors.size, 1), 1.5, 60.0)
             drawn = axes.scatter(u, v, c=errors, s=size, linewidths=0, **style)
         axes.margins(0.02)
+    draw_loops(axes, trimmed)
     _mark_folds(axes, fit, errors.shape)
     _turn_like_the_surface(axes, fit.surface, view)
     bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02)
@@ -140,12 +154,23 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
         f"average {100 * float(fit.average_error):.3g} %, "
         f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal"
     )
-    axes.set_title(caption + ("\ncrosses: folds" if fit.regularity.folds else ""), fontsize=11)
+    if errors.size and trimmed is not None:
+        within = f"inside the loops: average {errors.mean():.3g} %, maximum {errors.max():.3g} %"
+        caption = f"{within}\nall {inside.size:,} points: {caption}"
+    folds = len(folds_in(of_fit(fit), fit.regularity))
+    axes.set_title(caption + ("\ncrosses: folds" if folds else ""), fontsize=11)
+
+
+def draw_loops(axes: "Axes", trimmed: TrimmedSurface | None) -> None:
+    """The outer loop as a full line and the holes as dashed ones, over the parameters."""
+    for i, loop in enumerate([] if trimmed is None else host_loops(trimmed)):
+        closed = np.concatenate([loop, loop[:1]])
+        axes.plot(*closed.T, color=_LOOP, linewidth=1.2, linestyle="--" if i else "-")
 
 
 def _mark_folds(axes: "Axes", fit: Any, shape: tuple[int, ...]) -> None:
     """A cross at each fold, over the parameters or over the rows and columns of a grid."""
-    places = fit.regularity.fold_parameters
+    places = folds_in(of_fit(fit), fit.regularity)
     if not len(places):
         return
     at = list(places.T)

@@ -7,6 +7,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._base._host_splines import basis_matrix
 from jaxfit._splines import BSplineSurface
+from jaxfit._trimmed import TrimmedSurface
+from jaxfit.plot._part import ranges, shown, whole
 from jaxfit.plot._view import View, choose_view
 
 _PIXELS = 1400  # longer side of the raw picture, which is halved in the end
@@ -21,12 +23,13 @@ _PLAIN = np.array([0.84, 0.80, 0.72])
 _HEIGHTS = np.array([[0.47, 0.57, 0.44], [0.80, 0.77, 0.60], [0.70, 0.57, 0.45], [0.96, 0.94, 0.91]])
 _LINE = np.array([0.13, 0.25, 0.40], np.float32)
 FOLD = np.array([0.86, 0.10, 0.16], np.float32)
+_RIM = 3  # samples by which a loop is drawn inwards
 _FOLD_RADIUS = 6  # in samples, so about five raw pixels
 _LIGHT = np.array([-0.68, 0.42, 0.60])  # from the upper left, in front of the picture
 
 
 def render(
-    surface: BSplineSurface,
+    part: BSplineSurface | TrimmedSurface,
     aspect: float = 1.1,
     view: View | None = None,
     paint: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
@@ -36,18 +39,24 @@ def render(
 
     The picture is transparent round the surface, and `aspect` times as wide as high. A `paint`
     gives the colours (a, b, 3) at parameters (a,) and (b,); nothing is shaded or drawn on them but red spots
-    at the parameters of `folds`, where they can be seen.
+    at the parameters of `folds`, where they can be seen. Of a trimmed surface nothing outside its loops is
+    drawn, and they are.
     """
-    us, vs, coarse = coarse_points(surface)
+    surface = whole(part)
+    us, vs, coarse = coarse_points(part)
     view = choose_view(coarse) if view is None else view
     seen = view(coarse)
-    size = np.ptp(seen[..., :2].reshape(-1, 2), axis=0).max()
+    kept = shown(part, us, vs)
+    framed = seen[kept] if kept.any() else seen.reshape(-1, 3)
+    size = np.ptp(framed[:, :2], axis=0).max()
     pixel = max(size, np.finfo(float).tiny) / (_PIXELS - 1)
     us, vs = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
     # The view is affine: applied to the control points, it applies to the surface.
-    net = (view(_net(surface)) - seen.reshape(-1, 3).min(axis=0)) / pixel
+    net = (view(_net(surface)) - framed.min(axis=0)) / pixel
     points = _Samples(surface, us, vs)
-    keys = _nearest(*(points(net[..., c]) for c in range(3)))
+    kept = shown(part, us, vs)
+    x, y, z = (points(net[..., c])[kept] for c in range(3))
+    keys = _nearest(x, y, z, np.flatnonzero(kept))
     filled = keys >= 0
     index = keys[filled] & ((1 << _INDEX_BITS) - 1)
     image = np.zeros((*keys.shape, 4), np.float32)
@@ -63,6 +72,8 @@ def render(
             near = _near_a_knot(np.asarray(knots, dtype=float), at)[number]
             colour[near] = 0.5 * colour[near] + 0.5 * _LINE
         image[filled, :3] = np.clip(colour, 0, 1)
+    if isinstance(part, TrimmedSurface):
+        image[filled, :3] = np.where(_rim(kept).ravel()[index, None], _LINE, image[filled, :3])
     if folds is not None and len(folds):
         image[filled, :3] = np.where(_near(folds, us, vs).ravel()[index, None], FOLD, image[filled, :3])
     return _pad(_halve(image), aspect), view
@@ -87,9 +98,10 @@ class _Samples:
         return self._u[du] @ net.astype(self._dtype) @ self._v[dv].T
 
 
-def coarse_points(surface: BSplineSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def coarse_points(part: BSplineSurface | TrimmedSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evenly spaced parameters along u and along v, and the points there: enough to choose a view."""
-    us, vs = (np.linspace(float(low), float(high), _COARSE) for low, high in surface.domain)
+    surface = whole(part)
+    us, vs = (np.linspace(low, high, _COARSE) for low, high in ranges(part))
     points, net = _Samples(surface, us, vs, float), _net(surface)
     return us, vs, np.stack([points(net[..., c]) for c in range(3)], axis=-1)
 
@@ -161,18 +173,28 @@ def _near(places: np.ndarray, us: np.ndarray, vs: np.ndarray) -> Bool[np.ndarray
     return near
 
 
-def _nearest(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Int[np.ndarray, "height width"]:
-    """For every raw pixel a key of the sample in front: its depth in the upper bits, its index in the
-    lower ones. -1 is an empty pixel.
+def _rim(kept: Bool[np.ndarray, "a b"]) -> Bool[np.ndarray, "a b"]:
+    """Samples within a few of one that is not kept."""
+    from scipy.ndimage import binary_erosion
+
+    return kept & ~binary_erosion(kept, np.ones((3, 3), bool), iterations=_RIM)
+
+
+def _nearest(
+    x: Float[np.ndarray, " k"],
+    y: Float[np.ndarray, " k"],
+    z: Float[np.ndarray, " k"],
+    index: Int[np.ndarray, " k"],
+) -> Int[np.ndarray, "height width"]:
+    """For every raw pixel a key of the sample in front: its depth in the upper bits, its number in `index` in
+    the lower ones. -1 is an empty pixel.
     """
     column = np.rint(x + (2 - x.min())).astype(np.int32)
     row = np.rint((y.max() + 2) - y).astype(np.int32)
     width, height = int(column.max()) + 3, int(row.max()) + 3
-    depth = ((z - z.min()) * _DEPTHS).astype(np.int64).ravel()
+    depth = ((z - z.min()) * _DEPTHS).astype(np.int64)
     keys = np.full((height, width), -1)
-    np.maximum.at(
-        keys.ravel(), (row * width + column).ravel(), (depth << _INDEX_BITS) + np.arange(depth.size)
-    )
+    np.maximum.at(keys.ravel(), row * width + column, (depth << _INDEX_BITS) + index)
     for _ in range(2):
         keys = _close_gaps(keys)
     return keys

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from jaxfit._checks import as_direction, check_kind
 from jaxfit._quality import regularity
 from jaxfit._quality._zebra import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
+from jaxfit._trimmed import TrimmedSurface
+from jaxfit.plot._part import folds_in, whole
 from jaxfit.plot._picture import blank_figure, save
 from jaxfit.plot._render import FOLD, coarse_points, render
 from jaxfit.plot._view import View, choose_view, view_from
@@ -24,7 +26,7 @@ _SHARPNESS = 4.0  # a wave of this height, cut at 0 and 1, is nearly a step
 
 
 def zebra_stripes(
-    surfaces: BSplineSurface | Sequence[BSplineSurface],
+    surfaces: BSplineSurface | TrimmedSurface | Sequence[BSplineSurface | TrimmedSurface],
     path: str | os.PathLike | None = None,
     captions: Sequence[str] = (),
     stripes: int = 16,
@@ -43,7 +45,8 @@ def zebra_stripes(
     Parameters
     ----------
     surfaces
-        What to draw, in three dimensions, best in the same place and unit.
+        What to draw, in three dimensions, best in the same place and unit. Of trimmed surfaces only what
+        is inside the loops.
     path
         Where to save the picture (.png, .pdf, .svg, ...), whole or not at all; None saves nothing.
     captions
@@ -80,7 +83,7 @@ def zebra_stripes(
     figure = blank_figure(6 * len(drawn), rows)
     axes = figure.subplots(rows, len(drawn), squeeze=False)
     for i, surface in enumerate(drawn):
-        places = regularity(surface).fold_parameters
+        places = folds_in(surface, regularity(whole(surface)))
         if shaded:
             axes[0, i].imshow(render(surface, view=camera, folds=places)[0])
         axes[-1, i].imshow(_striped(surface, camera, axis, stripes, places))
@@ -96,34 +99,37 @@ def zebra_stripes(
 
 
 def _striped(
-    surface: BSplineSurface, camera: View, axis: Vector, stripes: int, folds: np.ndarray
+    part: BSplineSurface | TrimmedSurface, camera: View, axis: Vector, stripes: int, folds: np.ndarray
 ) -> np.ndarray:
     def paint(us: np.ndarray, vs: np.ndarray) -> np.ndarray:
-        values = np.asarray(zebra_grid(surface, us, vs, axis, stripes, camera.toward), dtype=float)
+        values = np.asarray(zebra_grid(whole(part), us, vs, axis, stripes, camera.toward), dtype=float)
         bright = np.clip(0.5 + _SHARPNESS * (values - 0.5), 0, 1)[..., None]
         return np.where(np.isnan(bright), FOLD, _DARK + bright * (_BRIGHT - _DARK))
 
-    return render(surface, view=camera, paint=paint, folds=folds)[0]
+    return render(part, view=camera, paint=paint, folds=folds)[0]
 
 
-def _camera(surface: BSplineSurface, view: Vector | None) -> View:
+def _camera(part: BSplineSurface | TrimmedSurface, view: Vector | None) -> View:
     if view is None:
         # The eye of the chosen view, but no stretch: stripes are those of the true shape.
-        return view_from(choose_view(coarse_points(surface)[2]).toward)
+        return view_from(choose_view(coarse_points(part)[2]).toward)
     return view_from(np.asarray(as_direction("view", view, 3), dtype=float))
 
 
 def _checked(
-    surfaces: BSplineSurface | Sequence[BSplineSurface], captions: Sequence[str]
-) -> list[BSplineSurface]:
-    drawn = [surfaces] if isinstance(surfaces, BSplineSurface) else list(surfaces)
+    surfaces: BSplineSurface | TrimmedSurface | Sequence[BSplineSurface | TrimmedSurface],
+    captions: Sequence[str],
+) -> list[BSplineSurface | TrimmedSurface]:
+    single = isinstance(surfaces, (BSplineSurface, TrimmedSurface))
+    drawn: list[Any] = [surfaces] if single else list(surfaces)  # type: ignore[arg-type]
     if not drawn:
         raise ValueError("surfaces must hold at least one surface, but is empty; give one.")
     for surface in drawn:
-        check_kind("surfaces", surface, BSplineSurface, "a BSplineSurface or a list of them")
-        if surface.dimension != 3:
+        kinds = (BSplineSurface, TrimmedSurface)
+        check_kind("surfaces", surface, kinds, "a BSplineSurface or a list of them")
+        if whole(surface).dimension != 3:
             raise ValueError(
-                f"surfaces must be in three dimensions, but one has {surface.dimension}; use affine() "
+                f"surfaces must be in three dimensions, but one has {whole(surface).dimension}; use affine() "
                 "to take it there."
             )
     if captions and len(captions) != len(drawn):

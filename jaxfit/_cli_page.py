@@ -1,0 +1,47 @@
+"""The page that `--report` writes: what was read, what was asked, and the fit."""
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+import jaxfit
+from jaxfit import io
+from jaxfit._cli_fit import FittedFile
+from jaxfit._cli_methods import OPTIONS
+
+_SETTINGS = "method net order grid boundary tol_average tol_maximum max_steps float32".split()
+
+
+def write_page(
+    args: argparse.Namespace,
+    data: io.PointData,
+    done: FittedFile,
+    read: Mapping[str, str],
+    written: Mapping[str, str],
+) -> None:
+    """Write ``args.report``; `read` and `written` are rows of the command's table."""
+    from jaxfit.plot import report
+
+    report(
+        done.fit,
+        args.report,
+        points=data.cloud if data.grid is None else data.grid,
+        title=data.name,
+        tables={"Input": read, "Settings": _settings(args), "Output": written},
+        version=jaxfit.__version__,
+    )
+
+
+def _settings(args: argparse.Namespace) -> dict[str, str]:
+    """The options that were given, by the names they have on the command line."""
+    given = {name: getattr(args, name) for name in (*_SETTINGS, *OPTIONS)}
+    said = {name: _said(name, value) for name, value in given.items() if value not in (None, False)}
+    return {f"--{name.replace('_', '-')}": value for name, value in said.items()}
+
+
+def _said(name: str, value: Any) -> str:
+    if isinstance(value, tuple):
+        return "{}x{}".format(*value)
+    if name.startswith("tol_"):
+        return f"{value:g} %"
+    return "yes" if value is True else str(value)

@@ -1,0 +1,67 @@
+"""`loops`: the region of a trimmed fit in the domain of its surface."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jaxfit._trimmed._area import knot_lines
+from jaxfit.plot._picture import blank_figure, draw_loops, save
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MOST_POINTS = 20_000  # drawn; of more every so many
+
+
+def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi: int = 150) -> "Figure":
+    """One picture of the parameters (u, v): the loops, the knots, and the points inside and outside.
+
+    Parameters
+    ----------
+    fit
+        A `jaxfit.Fit`; without loops all points are inside.
+    path
+        Where to save the picture (.png, .pdf, .svg, ...), whole or not at all; None saves nothing.
+    title
+        Heading, for instance the name of the data.
+    dpi
+        Pixels per inch; the picture is 7 x 5.2 inches.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ImportError
+        If Matplotlib is not installed.
+    """
+    figure = blank_figure(7)
+    axes = figure.subplots()
+    for lines, draw in zip(knot_lines(fit.surface), (axes.axvline, axes.axhline), strict=True):
+        for at in lines:
+            draw(at, color="0.88", linewidth=0.5, zorder=0)
+    u, v = (np.asarray(x, float).reshape(-1) for x in (fit.u, fit.v))
+    trimmed = getattr(fit, "trimmed", None)
+    inside = np.ones(u.size, bool) if trimmed is None else np.asarray(fit.inside).reshape(-1)
+    every = -(-u.size // _MOST_POINTS)
+    for mask, colour, label in ((inside, "0.45", "inside"), (~inside, "tab:red", "outside")):
+        if mask.any():
+            style: dict[str, Any] = {
+                "s": 2.0,
+                "linewidths": 0,
+                "color": colour,
+                "label": f"{int(mask.sum()):,} points {label}",
+            }
+            axes.scatter(u[mask][::every], v[mask][::every], **style)
+    draw_loops(axes, trimmed)
+    axes.set_xlabel("u")
+    axes.set_ylabel("v")
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.9, markerscale=4)
+    if title:
+        figure.suptitle(title, fontsize=14, fontweight="bold")
+    if path is not None:
+        save(figure, Path(path), dpi)
+    return figure

@@ -1,0 +1,143 @@
+"""`report`: a fit on one page of HTML, with its pictures inside."""
+
+import base64
+import html
+import io
+import os
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import scipy
+
+from jaxfit._fit._summary import facts
+from jaxfit.io._output import write_atomically
+from jaxfit.plot._history import history
+from jaxfit.plot._loops import loops
+from jaxfit.plot._part import of_fit
+from jaxfit.plot._picture import surface_and_errors
+from jaxfit.plot._zebra import zebra_stripes
+
+_DPI = 110
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; color: #222; background: #fff; max-width: 64rem;
+  margin: 0 auto; padding: 1rem; }}
+h1 {{ font-size: 1.5rem; overflow-wrap: anywhere; }}
+h2 {{ font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid #ddd; }}
+table {{ border-collapse: collapse; width: 100%; }}
+th, td {{ text-align: left; vertical-align: top; padding: 0.2rem 0.8rem 0.2rem 0; overflow-wrap: anywhere; }}
+th {{ font-weight: 600; width: 30%; }}
+figure {{ margin: 1rem 0; }}
+img {{ display: block; max-width: 100%; height: auto; margin: 0 auto; }}
+figcaption {{ color: #555; font-size: 0.9rem; }}
+</style>
+</head>
+<body>
+<h1>{title}</h1>
+{body}
+</body>
+</html>
+"""
+
+
+def report(
+    fit: Any,
+    path: str | os.PathLike,
+    points: Any = None,
+    title: str = "B-spline surface",
+    tables: Mapping[str, Mapping[str, str]] | None = None,
+    version: str = "",
+) -> None:
+    """Write one page of HTML about a fit: result, pictures and versions, without requests to anywhere.
+
+    Pictures are those of `surface_and_errors` (with folds), `zebra_stripes` of a surface in space, `loops`
+    and `history`, inside the page. The page can be read on a telephone.
+
+    Parameters
+    ----------
+    fit
+        A `jaxfit.Fit`.
+    path
+        The file, by convention `.html`. It appears whole or not at all, and replaces an older one.
+    points
+        The data, as for `surface_and_errors`.
+    title
+        Heading, for instance the name of the data.
+    tables
+        More tables, by their headings; they come first.
+    version
+        That of the program that asks, for the table of versions.
+
+    Raises
+    ------
+    ImportError
+        If Matplotlib is not installed.
+    OSError
+        If the file cannot be written.
+    """
+    rows = {
+        **(tables or {}),
+        "Result": {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)},
+    }
+    parts = [_table(heading, values) for heading, values in rows.items()]
+    parts += [_figure(*picture) for picture in _pictures(fit, points)]
+    parts.append(_table("Versions", _versions(version)))
+    page = _PAGE.format(title=html.escape(title), body="\n".join(parts))
+    write_atomically(path, page.encode())
+
+
+def _pictures(fit: Any, points: Any) -> list[tuple[str, Any, str]]:
+    """Heading, figure and caption of each."""
+    folds = "Folds are red on the surface and crosses over the parameters."
+    trimmed = getattr(fit, "trimmed", None)
+    pictures = [
+        ("Errors and folds", surface_and_errors(fit, points), f"Distances of the points. {folds}"),
+    ]
+    if fit.surface.dimension == 3:
+        stripes = "Lights reflected in the surface: where they kink or wiggle, so does it."
+        pictures.append(("Zebra stripes", zebra_stripes(of_fit(fit)), stripes))
+    if trimmed is not None or np.ndim(fit.errors) == 1:
+        where = "Feet of the points in the domain, and its knots"
+        caption = f"{where}, with the outer loop (full) and holes (dashed)." if trimmed else f"{where}."
+        pictures.append(("Loops" if trimmed else "Parameters", loops(fit), caption))
+    pictures.append(("History", history(fit), "Errors after every iteration."))
+    return pictures
+
+
+def _table(heading: str, rows: Mapping[str, str]) -> str:
+    cells = (
+        f"<tr><th>{html.escape(str(name))}</th><td>{html.escape(str(value))}</td></tr>"
+        for name, value in rows.items()
+    )
+    return f"<h2>{html.escape(heading)}</h2>\n<table>\n{chr(10).join(cells)}\n</table>"
+
+
+def _figure(heading: str, figure: Any, caption: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    name = html.escape(heading)
+    return (
+        f'<h2>{name}</h2>\n<figure><img alt="{name}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def _versions(version: str) -> dict[str, str]:
+    device = jax.devices()[0]
+    return {
+        **({"jaxfit": version} if version else {}),
+        "Python": platform.python_version(),
+        "JAX": f"{jax.__version__} on {device.platform} ({device.device_kind})",
+        "NumPy": np.__version__,
+        "SciPy": scipy.__version__,
+        "system": f"{platform.system()} {platform.machine()}",
+    }
