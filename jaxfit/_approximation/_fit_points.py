@@ -8,9 +8,12 @@ from jax.typing import ArrayLike
 
 from jaxfit._approximation._approximate import LEAST_POINTS, approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._checked_scan import checked_scan
+from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
-from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net
+from jaxfit._approximation._level_nets import BoundaryNets
+from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, checked_net, default_base, default_net
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
@@ -24,6 +27,8 @@ def fit_points(
     order: tuple[int, int] = (4, 4),
     method: AbstractIterativeMethod | None = None,
     base: Coons | AbstractBaseMethod | None = None,
+    faces: ArrayLike | None = None,
+    hole_length: float | None = None,
     **options: Any,
 ) -> Fit:
     """Fit a surface to a cloud of points with four boundary polylines: `base_surface`, then `approximate`.
@@ -78,16 +83,15 @@ def fit_points(
     _check_names(options)
     check_order(order)
     if boundary is None:
-        raise ValueError(
-            "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
-            "four polylines around the patch."
-        )
+        return _without_boundary(points, faces, hole_length, net, order, method, base, options)
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     checked_request(cloud, method=method, **options)
     if net is None and _may_grow(cloud, method, options):
         request = _DEFAULTS | options
-        growth = NetGrowth(np.asarray(cloud), boundary, order, default_method(method), request)
+        growth = NetGrowth(
+            np.asarray(cloud), BoundaryNets(boundary, order), default_method(method), request
+        )
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
     return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
@@ -97,6 +101,26 @@ def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int
     if base is None and is_concrete(cloud):
         return default_base(boundary, np.asarray(cloud), net, order)
     return base_surface(boundary, cloud, net=net, order=order, method=base)
+
+
+def _without_boundary(
+    points: Any,
+    faces: Any,
+    hole_length: Any,
+    net: Any,
+    order: tuple[int, int],
+    method: Any,
+    base: Any,
+    options: dict[str, Any],
+) -> Fit:
+    scan = checked_scan(points, faces, hole_length, base, options.get("start"))
+    finite = np.isfinite(scan.points).all(axis=1)
+    if finite.any():  # or else `fit_scan` says what is wrong
+        whole = np.where(finite[:, None], scan.points, scan.points[np.argmax(finite)])
+        checked_request(whole, method=method, **options)
+    net = None if net is None else checked_net(net, order)
+    grows = net is None and _may_grow(scan.points[finite], method, options)
+    return fit_scan(scan, net, order, method, _DEFAULTS | options, grows)
 
 
 def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._approximate import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
-from jaxfit._base import Boundary, carried_base, net_of_size
+from jaxfit._approximation._level_nets import AbstractNets
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._splines import BSplineSurface
@@ -35,18 +35,17 @@ class Level(NamedTuple):
 
 
 class NetGrowth:
-    """The levels of one cloud, from coarse to fine."""
+    """The levels of one cloud, from coarse to fine; `feet` are those on the first base surface, if known."""
 
     def __init__(
         self,
         points: Float[np.ndarray, "points d"],
-        boundary: Boundary,
-        order: tuple[int, int],
+        nets: AbstractNets,
         method: Any,
         request: dict[str, Any],
+        feet: tuple[Any, Any] | None = None,
     ):
-        self.points, self.boundary, self.order, self.method = points, boundary, order, method
-        self.request = request
+        self.points, self.nets, self.method, self.request, self.feet = points, nets, method, request, feet
         given = request["weights"]
         self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
         self.sorted = np.lexsort(points.T)  # an even choice, whatever order the points came in
@@ -54,7 +53,7 @@ class NetGrowth:
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
-        return net_of_size(size, self.boundary, self.order, MOST_SIZE)
+        return self.nets.net(size, MOST_SIZE)
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
@@ -68,19 +67,18 @@ class NetGrowth:
             best, size = level, size * self._growth(level.fit)
             if size > self.most:
                 return best, RESULTS.net_exhausted
-            base, before = self.carried(level.fit.surface, size), level
-
-    def carried(self, surface: BSplineSurface, size: float) -> BSplineSurface:
-        """`surface` with another net."""
-        return carried_base(surface, self.boundary, self.net(size), self.order)
+            base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 
     def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
         some, held_out = self._chosen(size)
         weights = self.weights[some]
-        same = before is not None and len(before.fit.u) == len(some)
+        start = None if self.feet is None else tuple(x[some] for x in self.feet)
+        if before is not None:
+            same = len(before.fit.u) == len(some)
+            start = (before.fit.u, before.fit.v) if same else None
         request = self.request | {
             "weights": np.where(held_out, 0.0, weights),
-            "start": (before.fit.u, before.fit.v) if before is not None and same else None,
+            "start": start,
             "max_steps": min(LEVEL_STEPS, self.request["max_steps"]),
             "throw": False,
             "errors": LocalFeet(),
@@ -118,7 +116,7 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
         size *= LEAST_GROWTH
         if bool(fit.converged) or size > growth.most:
             break
-        fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request)
+        fit = fit_cloud(growth.points, growth.nets.carried(fit.surface, growth.net(size)), growth.method, request)
     if not bool(fit.converged) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit
