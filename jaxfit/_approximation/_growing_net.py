@@ -35,7 +35,7 @@ class Level(NamedTuple):
 
 
 class NetGrowth:
-    """The levels of one cloud, from coarse to fine; `feet` are those on the first base surface, if known."""
+    """The levels of one cloud, from coarse to fine."""
 
     def __init__(
         self,
@@ -43,9 +43,8 @@ class NetGrowth:
         nets: AbstractNets,
         method: Any,
         request: dict[str, Any],
-        feet: tuple[Any, Any] | None = None,
     ):
-        self.points, self.nets, self.method, self.request, self.feet = points, nets, method, request, feet
+        self.points, self.nets, self.method, self.request = points, nets, method, request
         given = request["weights"]
         self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
         self.sorted = np.lexsort(points.T)  # an even choice, whatever order the points came in
@@ -72,10 +71,11 @@ class NetGrowth:
     def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
         some, held_out = self._chosen(size)
         weights = self.weights[some]
-        start = None if self.feet is None else tuple(x[some] for x in self.feet)
-        if before is not None:
-            same = len(before.fit.u) == len(some)
-            start = (before.fit.u, before.fit.v) if same else None
+        start, feet = None, self.nets.feet(self.net(size))
+        if feet is not None:
+            start = feet[0][some], feet[1][some]
+        elif before is not None and len(before.fit.u) == len(some):
+            start = before.fit.u, before.fit.v
         request = self.request | {
             "weights": np.where(held_out, 0.0, weights),
             "start": start,
@@ -108,15 +108,18 @@ class NetGrowth:
 def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     """The fit with a net of the size that the tolerances take, or that the points allow."""
     level, why = growth.grown(base)
-    size, request = level.size, growth.request | {"throw": False, "start": None}
+    size, request = level.size, growth.request | {"throw": False}
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
+    request["start"] = growth.nets.feet(growth.net(size))
     fit = fit_cloud(growth.points, level.fit.surface, growth.method, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= LEAST_GROWTH
         if bool(fit.converged) or size > growth.most:
             break
-        fit = fit_cloud(growth.points, growth.nets.carried(fit.surface, growth.net(size)), growth.method, request)
+        net = growth.net(size)
+        request["start"] = growth.nets.feet(net)
+        fit = fit_cloud(growth.points, growth.nets.carried(fit.surface, net), growth.method, request)
     if not bool(fit.converged) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit

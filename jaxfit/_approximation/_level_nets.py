@@ -1,14 +1,19 @@
 """The nets that a growing fit goes through: with a boundary, and for a sheet without."""
 
-from abc import abstractmethod
+import dataclasses
+from abc import ABC, abstractmethod
 
-import equinox as eqx
+import numpy as np
+from jaxtyping import Float
 
-from jaxfit._base import Boundary, carried_base, carried_free_base, net_of_ratio, net_of_size
+from jaxfit._base import Boundary, carried_base, free_base, net_of_ratio, net_of_size
+from jaxfit._scan import Sheet
 from jaxfit._splines import BSplineSurface
 
+Feet = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
-class AbstractNets(eqx.Module):
+
+class AbstractNets(ABC):
     """Nets of every size, and a surface taken from one to another."""
 
     @abstractmethod
@@ -20,6 +25,12 @@ class AbstractNets(eqx.Module):
         """`surface` with another net."""
 
 
+    @abstractmethod
+    def feet(self, net: tuple[int, int]) -> Feet | None:
+        """Those of the points on every surface that is new to them, if known."""
+
+
+@dataclasses.dataclass
 class BoundaryNets(AbstractNets):
     """The sides are those of the boundary with every net."""
 
@@ -34,17 +45,32 @@ class BoundaryNets(AbstractNets):
         """On the knots of the boundary curves, with these as sides."""
         return carried_base(surface, self.boundary, net, self.order)
 
+    def feet(self, net: tuple[int, int]) -> None:
+        """To be searched."""
 
-class FreeNets(AbstractNets):
-    """Uniform knots; `ratio` squared is the length of the domain along u over that along v."""
 
-    ratio: float
+@dataclasses.dataclass
+class SheetNets(AbstractNets):
+    """Surfaces beyond the sheet on all sides, on uniform knots, each at parameters made for it."""
+
+    sheet: Sheet
     order: tuple[int, int]
 
     def net(self, size: float, most: int) -> tuple[int, int]:
-        """Shared between the directions by the sides of the domain."""
-        return net_of_ratio(size, self.ratio, self.order, most)
+        """Shared between the directions by the sides of the sheet laid out flat."""
+        return net_of_ratio(size, float(np.sqrt(self.sheet.sides[0] / self.sheet.sides[1])), self.order, most)
+
+    def base(self, net: tuple[int, int]) -> BSplineSurface:
+        """A smoothed surface."""
+        some = self.sheet.on_sheet
+        points = self.sheet.points[some] * self.sheet.size + self.sheet.centre
+        return free_base(points, self.sheet.layout(net, self.order).parameters[some], net, self.order)
 
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
-        """Interpolated on other knots."""
-        return carried_free_base(surface, net, self.order)
+        """A smoothed surface as well: what a coarse net made of the parameters is forgotten."""
+        return self.base(net)
+
+    def feet(self, net: tuple[int, int]) -> Feet:
+        """The parameters of all finite points; those that are not on the sheet get their neighbours'."""
+        parameters = self.sheet.layout(net, self.order).parameters[self.sheet.nearest]
+        return parameters[:, 0], parameters[:, 1]

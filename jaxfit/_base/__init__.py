@@ -20,7 +20,6 @@ from jaxfit._base._default_net import default_size as default_size
 from jaxfit._base._default_net import net_of_ratio as net_of_ratio
 from jaxfit._base._default_net import net_of_size as net_of_size
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
-from jaxfit._base._free_base import carried_free_base as carried_free_base
 from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters

@@ -20,11 +20,11 @@ def carried_base(
     sides = base_surface(boundary, net=net, order=order)
     knots = (np.asarray(sides.knots_u, float), np.asarray(sides.knots_v, float))
     carried = np.array(sides.control_points)
-    carried[1:-1, 1:-1] = interpolated(surface, knots, order)[1:-1, 1:-1]
+    carried[1:-1, 1:-1] = _interpolated(surface, knots, order)[1:-1, 1:-1]
     return BSplineSurface(carried, sides.knots_u, sides.knots_v)
 
 
-def interpolated(
+def _interpolated(
     surface: BSplineSurface, knots: Knots, order: tuple[int, int]
 ) -> Float[np.ndarray, "nu nv d"]:
     """The net on these knots whose surface passes through `surface` at their Greville abscissae."""

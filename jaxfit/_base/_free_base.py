@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._carried_base import interpolated
 from jaxfit._base._smoothed_net import smoothed_net
 from jaxfit._base._thin_plate_fit import ThinPlateFit
 from jaxfit._precision import working_dtype
@@ -33,14 +32,6 @@ def free_base(
     fit = ThinPlateFit(start, knots, order, parameters, middle / size, free_border=True)
     reach = float(np.linalg.norm(middle, axis=1).max()) / size
     return _surface(smoothed_net(fit, SMOOTHING, ROBUST, reach) * size + centre, knots)
-
-
-def carried_free_base(
-    surface: BSplineSurface, net: tuple[int, int], order: tuple[int, int]
-) -> BSplineSurface:
-    """`surface` on uniform knots for `net`, interpolated at the Greville abscissae."""
-    knots = _uniform_knots(net, order)
-    return _surface(interpolated(surface, knots, order), knots)
 
 
 def _uniform_knots(net: tuple[int, int], order: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,6 @@ from jaxfit._scan._isometric_map import Triangles, isometric_maps, rest_triangle
 from jaxfit._scan._manifold import Faces
 
 HOLE_SHARE = 0.05  # of its area, by which a triangle across a hole resists distortion
-MARGIN = 0.04  # of the mean side of the rectangle, on all four sides
 
 
 def flat_places(
@@ -41,19 +40,15 @@ def _is_simple(loop: Float[np.ndarray, "loop 2"]) -> bool:
 
 
 class Rectangle(NamedTuple):
-    """The frame of the domain: (u, v) = (place @ axes.T - corner) / sides."""
+    """The frame of a rectangle: places @ axes.T - corner lie within its sides."""
 
     axes: Float[np.ndarray, "2 2"]
     corner: Float[np.ndarray, "2"]
     sides: Float[np.ndarray, "2"]
 
-    def parameters(self, places: Float[Any, "points 2"]) -> Float[np.ndarray, "points 2"]:
-        """In the unit square."""
-        return (places @ self.axes.T - self.corner) / self.sides
-
 
 def rectangle_around(places: Float[Any, "points 2"]) -> Rectangle:
-    """The smallest rectangle around the places, its longer side along u, with a margin."""
+    """The smallest rectangle around the places, its longer side along u."""
     from scipy.spatial import ConvexHull
 
     hull = places[ConvexHull(places).vertices]
@@ -68,5 +63,4 @@ def rectangle_around(places: Float[Any, "points 2"]) -> Rectangle:
         turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
         frame = turn @ frame
         low, extent = (hull @ frame.T).min(axis=0), extent[::-1]
-    margin = MARGIN * extent.mean()
-    return Rectangle(frame, low - margin, extent + 2 * margin)
+    return Rectangle(frame, low, extent)

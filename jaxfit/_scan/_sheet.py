@@ -20,6 +20,7 @@ MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an e
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
 HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 OUTSET = 0.5  # of the spacing: how far beyond nodes that stand for several points the rim is
+LEAST_MARGIN, LARGEST_MARGIN = 0.02, 0.1  # of the domain
 COVERED = 0.75  # least share of the nodes on the largest piece
 
 
@@ -28,12 +29,13 @@ class Sheet(NamedTuple):
 
     points: Float[np.ndarray, "kept 3"]  # distinct, finite and not far off, centred, of size one
     number: Int[np.ndarray, " kept"]  # of each among the points handed in
+    nearest: Int[np.ndarray, " finite"]  # of the points handed in that are finite: which of these is nearest
     on_sheet: Bool[np.ndarray, " kept"]
-    parameters: Float[np.ndarray, "kept 2"]  # in the unit square, with a margin around the sheet
+    places: Float[np.ndarray, "kept 2"]  # in the plane, from 0 to `sides`
     nodes: Float[np.ndarray, "nodes 3"]  # of the mesh
     faces: Faces
     loops: list[Int[np.ndarray, " loop"]]  # nodes around the sheet, the rim first, the sheet to the left
-    sides: Float[np.ndarray, "2"]  # lengths of the domain along u and v
+    sides: Float[np.ndarray, "2"]  # of the smallest rectangle around the sheet laid out flat
     centre: Float[np.ndarray, "3"]
     size: float
     spacing: float  # between nodes around it
@@ -41,10 +43,28 @@ class Sheet(NamedTuple):
     hole_length: float  # in the unit of the points handed in
     counts: dict[str, int]
 
+    def layout(self, net: tuple[int, int], order: tuple[int, int]) -> "Layout":
+        """Parameters for a net, with a margin of one knot span around the sheet.
+
+        The control points on the border then have no influence on the sheet, if the net is not too coarse.
+        """
+        spans = np.asarray(net) - np.asarray(order) + 1
+        share = np.clip(1 / spans, LEAST_MARGIN, LARGEST_MARGIN)
+        whole = self.sides / (1 - 2 * share)
+        inside = np.clip(self.places / whole + share, share, 1 - share)
+        return Layout(inside, whole)
+
     @property
     def area(self) -> float:
         """Of the mesh, in the squared unit of the points handed in."""
         return float(areas(self.nodes, self.faces).sum()) * self.size**2
+
+
+class Layout(NamedTuple):
+    """A sheet in the unit square."""
+
+    parameters: Float[np.ndarray, "kept 2"]
+    sides: Float[np.ndarray, "2"]  # lengths that the square stands for
 
 
 class _Mesh(NamedTuple):
@@ -77,7 +97,7 @@ def sheet_of(
     mesh, length = _mesh(cloud, _given_faces(points, clean, faces), asked)
     rectangle: Rectangle = rectangle_around(mesh.flat)
     on_sheet = mesh.away <= length
-    parameters = np.clip(rectangle.parameters(mesh.places), 0.0, 1.0)
+    places = np.clip(mesh.places @ rectangle.axes.T - rectangle.corner, 0.0, rectangle.sides)
     counts = {
         "points_read": len(points),
         "non_finite": clean.non_finite,
@@ -85,12 +105,19 @@ def sheet_of(
         "outliers": clean.outliers,
         "off_the_sheet": int((~on_sheet).sum()),
     }
+    nearest = _nearest((points[np.isfinite(points).all(axis=1)] - centre) / size, cloud)
     spacing = float(np.median(np.concatenate([_steps(mesh.nodes[x]) for x in mesh.loops])))
     outset = 0.0 if len(mesh.nodes) <= len(cloud) < MOST_NODES else OUTSET * spacing
     return Sheet(
-        cloud, clean.kept, on_sheet, parameters, mesh.nodes, mesh.faces, mesh.loops, rectangle.sides,
+        cloud, clean.kept, nearest, on_sheet, places, mesh.nodes, mesh.faces, mesh.loops, rectangle.sides,
         centre, size, spacing, outset, length * size, counts,
     )  # fmt: skip
+
+
+def _nearest(points: np.ndarray, cloud: np.ndarray) -> Int[np.ndarray, " points"]:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(cloud).query(points)[1]
 
 
 def _steps(loop: np.ndarray) -> np.ndarray:
@@ -103,33 +130,46 @@ def _mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple
         longest = longest_edges(cloud, faces)
         if length is not None:
             faces = faces[longest <= length]
-        faces = largest_piece(cloud, faces)
-        faces = faces if length is None else filled_holes(cloud, faces, length)
-        return _laid_out(cloud, cloud, faces), float(longest.max()) if length is None else length
+        whole = largest_piece(cloud, faces)
+        whole = whole if length is None else filled_holes(cloud, whole, length)
+        return _laid_out(cloud, cloud, whole, faces), float(longest.max()) if length is None else length
     nodes = cloud if len(cloud) <= MOST_NODES else _even_choice(cloud)
     reach = _hole_length(nodes) if length is None else length
     found = neighbourhood_mesh(nodes, reach)
     covered = np.bincount(pieces(found)).max() / (2 * len(nodes)) if len(found) else 0.0
     if covered < COVERED and is_level(cloud):
         return _level(cloud, length)
-    found = filled_holes(nodes, largest_piece(nodes, found), reach)
+    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
     if covered < COVERED:
         raise ValueError(
             f"points must lie on one sheet, but neighbours agree on a surface for only "
             f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
             "hole_length where they are sparse."
         )
-    return _laid_out(cloud, nodes, found), reach
+    return _laid_out(cloud, nodes, whole, found), reach
 
 
-def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces) -> _Mesh:
-    """A mesh of nodes in space; all points get places from the nearest node."""
+def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces) -> _Mesh:
+    """The largest piece of a mesh of nodes in space; all points get places from the nearest node.
+
+    Points next to another piece of the mesh `before` are off the sheet, however near they are.
+    """
     used = in_use(faces, len(nodes))
+    stray = _next_to(cloud, nodes, in_use(before, len(nodes)) & ~used, used)
     nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
     loops = sheet_loops(nodes, faces)
     flat = flat_places(nodes, faces, loops)
     places, away = carried_places(cloud, nodes, faces, flat)
-    return _Mesh(nodes, faces, loops, flat, places, away)
+    return _Mesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
+
+
+def _next_to(cloud: np.ndarray, nodes: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Which points are nearer to some nodes than to others."""
+    from scipy.spatial import cKDTree
+
+    if not some.any():
+        return np.zeros(len(cloud), bool)
+    return cKDTree(nodes[some]).query(cloud)[0] < cKDTree(nodes[others]).query(cloud)[0]
 
 
 def _level(cloud: np.ndarray, length: float | None) -> tuple[_Mesh, float]:

@@ -7,50 +7,63 @@ from jaxtyping import Float
 
 from jaxfit._closest import closest_point
 from jaxfit._scan._extras import import_shapely
+from jaxfit._scan._manifold import Faces
 from jaxfit._scan._sheet import Sheet
 from jaxfit._splines import BSplineSurface
 
 SMOOTHED = 0.5  # of the spacing: notches of the rim this narrow are closed
 STRAIGHT = 0.02  # of the spacing: vertices this near to the line between others are dropped
+LEAST_AREA = 1e-9  # of the mean: smaller triangles cover nothing
 LONGEST = 2.0  # times the spacing: longer edges are divided
 
 Loop = Float[np.ndarray, "vertices 2"]
 
 
 def trim_loops(
-    surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]
+    surface: BSplineSurface, sheet: Sheet, sides: Float[Any, "2"], feet: Float[Any, "kept 2"]
 ) -> tuple[Loop, ...]:
     """Closed polylines in (u, v), the rim first and counter-clockwise, holes clockwise.
 
-    The feet of the vertices around the mesh make a polygon. It is repaired where it crosses itself, grows
-    into its narrow notches, and never shrinks, so that the points on the rim stay inside.
+    They bound the union of the mesh's triangles, their vertices at their feet: whatever noise does to single
+    triangles, that is a region, and it holds the feet of all vertices. Its narrow notches and small gaps are
+    closed.
     """
     shapely = import_shapely()
     low, high = np.asarray(surface.domain, float).T
-    scale = sheet.sides / (high - low)  # (u, v) to about the lengths of the sheet
-    rings = [(x - low) * scale for x in _loop_feet(surface, sheet, feet)]
-    region = _largest(shapely.Polygon(rings[0]).buffer(0))
-    for ring in rings[1:]:
-        region = _largest(region.difference(shapely.Polygon(ring).buffer(0)))
+    scale = sides / (high - low)  # (u, v) to about the lengths of the sheet
+    region = _union((_node_feet(surface, sheet, feet) - low) * scale, sheet.faces)
     reach, least = SMOOTHED * sheet.spacing, STRAIGHT * sheet.spacing
     region = _largest(region.buffer(reach).buffer(-reach).simplify(least).buffer(least + sheet.outset))
-    box = shapely.box(0.0, 0.0, *sheet.sides)
-    region = _largest(region.intersection(box)).segmentize(LONGEST * sheet.spacing)
+    region = _largest(region.intersection(shapely.box(0.0, 0.0, *sides)))
+    holes = [x for x in region.interiors if shapely.Polygon(x).area > (sheet.hole_length / sheet.size) ** 2 / 4]
+    region = shapely.Polygon(region.exterior, holes).segmentize(LONGEST * sheet.spacing)
     region = shapely.orient_polygons(region)
     rings = [np.asarray(x.coords)[:-1] for x in (region.exterior, *region.interiors)]
     return tuple(np.clip(x / scale + low, low, high) for x in rings)
 
 
-def _loop_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> list[Loop]:
-    """Of the nodes around the sheet, found from the feet of the points next to them."""
+def _union(places: Float[Any, "nodes 2"], faces: Faces) -> Any:
+    """The region that triangles cover, whichever way round they are."""
+    shapely = import_shapely()
+    corners = places[faces]
+    triangles = shapely.polygons(corners)
+    area = shapely.area(triangles)
+    return _largest(shapely.union_all(triangles[area > LEAST_AREA * area.mean()]))
+
+
+def _node_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> Loop:
+    """Of the nodes of the mesh, found from the feet of the points next to them."""
     from scipy.spatial import cKDTree
 
-    nodes = sheet.nodes[np.concatenate(sheet.loops)]
     some = np.flatnonzero(sheet.on_sheet)
-    start = feet[some[cKDTree(sheet.points[some]).query(nodes)[1]]]
-    found = closest_point(surface, nodes * sheet.size + sheet.centre, start=(start[:, 0], start[:, 1]))
-    both = np.stack([np.asarray(found.u, float), np.asarray(found.v, float)], axis=1)
-    return np.split(both, np.cumsum([len(x) for x in sheet.loops])[:-1])
+    away, nearest = cKDTree(sheet.points[some]).query(sheet.nodes)
+    found = feet[some[nearest]]
+    rest = np.flatnonzero(away > 0)
+    if len(rest):
+        points = sheet.nodes[rest] * sheet.size + sheet.centre
+        foot = closest_point(surface, points, start=(found[rest, 0], found[rest, 1]))
+        found[rest] = np.stack([np.asarray(foot.u, float), np.asarray(foot.v, float)], axis=1)
+    return found
 
 
 def _largest(region: Any) -> Any:
