@@ -21,6 +21,7 @@ ROOMS = [
     ("_closest",),
     ("_normal_equations",),
     ("_base",),
+    ("_scan",),
     ("_quality",),
     ("_fit",),
     ("_interpolation",),
@@ -102,7 +103,7 @@ import jaxfit, jaxfit.io
 assert not jax.live_arrays(), jax.live_arrays()
 heavy = {"matplotlib", "jaxopt", "optimistix", "scipy.spatial", "scipy.interpolate", "rich"}
 assert not heavy & set(sys.modules), heavy & set(sys.modules)
-extra = {"OCP", "rhino3dm", "trimesh", "laspy", "lazrs", "pye57", "pypcd4"}
+extra = {"OCP", "rhino3dm", "trimesh", "laspy", "lazrs", "pye57", "pypcd4", "shapely"}
 assert not extra & set(sys.modules), extra & set(sys.modules)
 assert dict(jax.config.values) == before
 """

@@ -25,7 +25,7 @@ def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: An
         )
     if base is not None:
         raise ValueError(
-            f"base must be None where no boundary is given, but is {base!r}; leave it out, or pass a boundary."
+            f"base must be None where no boundary is given, but is {base!r}; leave it out or pass a boundary."
         )
     if start is not None:
         raise ValueError(
@@ -37,7 +37,7 @@ def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: An
         check_number("hole_length", hole_length, 0.0)
         if not hole_length > 0:
             raise ValueError(
-                f"hole_length must be positive, but is {hole_length!r}; give a length in the unit of the points."
+                f"hole_length must be positive, but is {hole_length!r}; give a length in the points' unit."
             )
     return ScanInput(
         cloud,

@@ -41,10 +41,11 @@ def fit_scan(
     if net is None and grows:
         growth = NetGrowth(cloud, nets, method, request)
         fit = fit_growing(growth, nets.base(growth.net(FIRST_SIZE)))
+        net = fit.surface.shape
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
         fit = fit_cloud(cloud, nets.base(net), method, request | {"start": nets.feet(net)})
-    return _with_loops(_for_all(fit, finite), sheet, sheet.layout(fit.surface.shape, order))
+    return _with_loops(_for_all(fit, finite), sheet, sheet.layout(net, order))
 
 
 def _for_all(fit: Fit, finite: np.ndarray) -> Fit:

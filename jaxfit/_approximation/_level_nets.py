@@ -24,7 +24,6 @@ class AbstractNets(ABC):
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """`surface` with another net."""
 
-
     @abstractmethod
     def feet(self, net: tuple[int, int]) -> Feet | None:
         """Those of the points on every surface that is new to them, if known."""

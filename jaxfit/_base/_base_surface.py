@@ -1,6 +1,5 @@
 """The base surface: boundary polylines to curves, curves to a Coons patch (paper section 2.3)."""
 
-
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -19,7 +18,6 @@ from jaxfit._splines import BSplineSurface
 MAX_STEPS = 100  # of the curve fit; few curves use them up
 CLOSE = 0.01  # the curve fit stops when its average error is this much of the tolerance
 FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are split in the middle
-
 
 
 @eager_where_concrete

@@ -1,4 +1,4 @@
-"""Base surfaces of points with parameters and without boundary: the border is where the thin plate puts it."""
+"""Base surfaces at given parameters, without a boundary: the thin plate decides where the border is."""
 
 from typing import Any
 

@@ -49,8 +49,9 @@ def _derivative_products(knots: np.ndarray, order: int) -> list[Any]:
 class ThinPlateFit:
     r"""The net that minimises $\sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F$.
 
-    Its border is that of `start`, or free. F is the thin plate over the unit square; $\lambda$ is `smoothing` times the trace of the matrix of
-    the sum with all w = 1, over that of F. With `smoothing` > 0 there is one solution whatever the points.
+    Its border is that of `start`, or free. F is the thin plate over the unit square; $\lambda$ is `smoothing`
+    times the trace of the matrix of the sum with all w = 1, over that of F. With `smoothing` > 0 there is one
+    solution whatever the points, if the border is given, and with three that are not in line, if it is free.
     """
 
     def __init__(

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit._base._thin_plate_fit import ThinPlateFit
 from jaxfit._base._host_splines import GridEvaluator, Knots
+from jaxfit._base._thin_plate_fit import ThinPlateFit
 
 LEAST_COSINE = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
 LEAST_COSINE_CREASED = -0.8  # the same for order 2, whose surfaces may have sharp edges at all knots

@@ -7,14 +7,14 @@ from jaxtyping import Float, Int
 
 from jaxfit._scan._convex_map import circle_map
 from jaxfit._scan._extras import import_shapely
-from jaxfit._scan._isometric_map import Triangles, isometric_maps, rest_triangles
+from jaxfit._scan._isometric_map import isometric_maps, rest_triangles
 from jaxfit._scan._manifold import Faces
 
 HOLE_SHARE = 0.05  # of its area, by which a triangle across a hole resists distortion
 
 
 def flat_places(
-    points: Float[Any, "points 3"], faces: Faces, loops: list[Int[np.ndarray, " loop"]]
+    points: Float[Any, "points 3"], faces: Faces, loops: list[Int[np.ndarray, " _"]]
 ) -> Float[np.ndarray, "points 2"]:
     """Places with little distortion and without flipped triangles, from the mesh alone.
 
@@ -35,7 +35,7 @@ def flat_places(
     return best[: len(points)]
 
 
-def _is_simple(loop: Float[np.ndarray, "loop 2"]) -> bool:
+def _is_simple(loop: Float[np.ndarray, "_ 2"]) -> bool:
     return bool(import_shapely().LinearRing(loop).is_simple)
 
 

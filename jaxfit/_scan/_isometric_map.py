@@ -1,8 +1,9 @@
 r"""Maps of a mesh to the plane with little distortion and no flipped triangle, its rim free.
 
-Minimises the symmetric Dirichlet energy $\sum_f A_f (|J_f|^2 + |J_f^{-1}|^2)$ over the places of the vertices,
-by the reweighted local/global iteration of Rabinovich, Poranne, Panozzo and Sorkine-Hornung (Scalable locally
-injective mappings, ACM Trans. Graph. 36, 2017). The energy is infinite where a triangle would flip.
+Minimises the symmetric Dirichlet energy $\sum_f A_f (|J_f|^2 + |J_f^{-1}|^2)$ over the places of the
+vertices, by the reweighted local/global iteration of Rabinovich, Poranne, Panozzo and Sorkine-Hornung
+(Scalable locally injective mappings, ACM Trans. Graph. 36, 2017). The energy is
+infinite where a triangle would flip.
 """
 
 from collections.abc import Iterator
@@ -13,8 +14,8 @@ from jaxtyping import Float
 
 from jaxfit._scan._manifold import Faces
 
-MOST_STEPS = 30
-ENOUGH = 2e-3  # a step that lowers the energy by less than this share is the last
+MOST_STEPS = 50
+ENOUGH = 2e-4  # a step that lowers the energy by less than this share is the last
 LEAST_HEIGHT = 0.05  # of a triangle over its longest edge; flatter ones count as if they were so high
 NEAR_FLIP = 0.8  # of the step at which the first triangle would flip
 SHORTEST = 1e-4  # step
@@ -34,9 +35,7 @@ class Triangles(NamedTuple):
         return np.swapaxes(places[self.faces], 1, 2) @ np.swapaxes(self.gradients, 1, 2)
 
 
-def rest_triangles(
-    points: Float[Any, "points 3"], faces: Faces, shares: Float[Any, " faces"]
-) -> Triangles:
+def rest_triangles(points: Float[Any, "points 3"], faces: Faces, shares: Float[Any, " faces"]) -> Triangles:
     """The triangles in planes of their own; `shares` are by how much their areas count."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     base = np.linalg.norm(b - a, axis=1)

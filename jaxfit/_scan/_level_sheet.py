@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfit._scan._manifold import Faces, manifold
 from jaxfit._scan._hole_filling import filled_holes
+from jaxfit._scan._manifold import Faces, manifold
 
 FLATTEST = 0.2  # the largest spread across the plane, over the smaller one within it
 POINTS_A_NODE = 4

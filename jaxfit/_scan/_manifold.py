@@ -1,11 +1,11 @@
-"""Triangles that agree on an orientation become a surface: every edge twice at most, one fan at each vertex."""
+"""Oriented triangles that make a surface: every edge twice at most, one fan at each vertex."""
 
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-Faces = Int[Any, "faces 3"]
+Faces = Int[Any, "_ 3"]
 
 
 def manifold(candidates: Faces) -> Faces:
@@ -41,7 +41,7 @@ def _single_fans(faces: Faces) -> Faces:
     return faces
 
 
-def fans(faces: Faces) -> Int[Any, "faces 3"]:
+def fans(faces: Faces) -> Int[Any, "_ 3"]:
     """For each corner of each triangle the number of the fan around its vertex: corners of triangles that
     share an edge at the vertex are of one fan."""
     from scipy.sparse import csr_array
@@ -85,7 +85,7 @@ def pieces(faces: Faces) -> Int[Any, " faces"]:
     return rank[piece]
 
 
-def boundary_loops(faces: Faces) -> list[Int[np.ndarray, " loop"]]:
+def boundary_loops(faces: Faces) -> list[Int[np.ndarray, " _"]]:
     """The closed polygons of vertices around a manifold, against the direction of its triangles' edges
     reversed: the surface lies to the left of each."""
     edges = directed_edges(faces)

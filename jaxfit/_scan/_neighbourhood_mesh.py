@@ -6,30 +6,28 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit._base import Stars, point_normals, stars
-from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
 NEIGHBOURS = 16  # of a point, among which its star is searched
-LEAST_VOTES = 2  # of the three stars that a triangle may be in
 WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
 
 
-def neighbourhood_mesh(points: Float[Any, "points 3"], length: float) -> Faces:
+def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_votes: int = 2) -> Faces:
     """Oriented triangles between the points, without edges longer than `length`.
 
     Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
-    come first, then those in two that fit in between, the shortest first; what is left open and not wider
-    than `length` is filled.
+    come first, then those in at least `least_votes` that fit in between, the shortest first. On an exact grid
+    that is bent both halves of a square may be in one star each; among noise such triangles make bridges.
     """
     star = stars(points, NEIGHBOURS, fixed=len(points))
     normals = point_normals(points, NEIGHBOURS)
     faces, votes = _candidates(star)
     longest = longest_edges(points, faces)
-    chosen = (votes >= LEAST_VOTES) & (longest <= length)
+    chosen = (longest <= length) & (votes >= least_votes)
     faces, votes, longest = faces[chosen], votes[chosen], longest[chosen]
     faces = faces[np.lexsort((longest, -votes))]
-    return filled_holes(points, manifold(_oriented(points, normals, faces)), length)
+    return manifold(_oriented(points, normals, faces))
 
 
 def _candidates(star: Stars) -> tuple[Faces, Int[np.ndarray, " faces"]]:

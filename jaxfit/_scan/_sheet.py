@@ -1,4 +1,4 @@
-"""From raw points to a sheet: which points are on it, their parameters, and the loops of its rim and holes."""
+"""From raw points to a sheet: which points are on it, their places when laid out flat, rim and holes."""
 
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an e
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
 HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 OUTSET = 0.5  # of the spacing: how far beyond nodes that stand for several points the rim is
+GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
+FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
 LEAST_MARGIN, LARGEST_MARGIN = 0.02, 0.1  # of the domain
 COVERED = 0.75  # least share of the nodes on the largest piece
 
@@ -34,7 +36,7 @@ class Sheet(NamedTuple):
     places: Float[np.ndarray, "kept 2"]  # in the plane, from 0 to `sides`
     nodes: Float[np.ndarray, "nodes 3"]  # of the mesh
     faces: Faces
-    loops: list[Int[np.ndarray, " loop"]]  # nodes around the sheet, the rim first, the sheet to the left
+    loops: list[Int[np.ndarray, " _"]]  # nodes around the sheet, the rim first, the sheet to the left
     sides: Float[np.ndarray, "2"]  # of the smallest rectangle around the sheet laid out flat
     centre: Float[np.ndarray, "3"]
     size: float
@@ -86,8 +88,8 @@ def sheet_of(
     clean = cleaned(points)
     if len(clean.kept) < LEAST_POINTS:
         raise ValueError(
-            f"points must hold at least {LEAST_POINTS} distinct and finite points where no boundary is given, "
-            f"but hold {len(clean.kept)}; give more, or pass a boundary."
+            f"points must hold at least {LEAST_POINTS} distinct and finite points without a boundary, but "
+            f"hold {len(clean.kept)}; give more, or pass a boundary."
         )
     cloud = points[clean.kept]
     centre = cloud.mean(axis=0)
@@ -132,13 +134,16 @@ def _mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple
             faces = faces[longest <= length]
         whole = largest_piece(cloud, faces)
         whole = whole if length is None else filled_holes(cloud, whole, length)
-        return _laid_out(cloud, cloud, whole, faces), float(longest.max()) if length is None else length
+        reach = float(longest.max()) if length is None else length
+        return _laid_out(cloud, cloud, whole, faces, reach), reach
     nodes = cloud if len(cloud) <= MOST_NODES else _even_choice(cloud)
     reach = _hole_length(nodes) if length is None else length
     found = neighbourhood_mesh(nodes, reach)
-    covered = np.bincount(pieces(found)).max() / (2 * len(nodes)) if len(found) else 0.0
-    if covered < COVERED and is_level(cloud):
-        return _level(cloud, length)
+    if (covered := _coverage(nodes, found)) < COVERED:
+        if is_level(cloud):
+            return _level(cloud, length)
+        found = neighbourhood_mesh(nodes, reach, least_votes=1)
+        covered = _coverage(nodes, found)
     whole = filled_holes(nodes, largest_piece(nodes, found), reach)
     if covered < COVERED:
         raise ValueError(
@@ -146,21 +151,38 @@ def _mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple
             f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
             "hole_length where they are sparse."
         )
-    return _laid_out(cloud, nodes, whole, found), reach
+    return _laid_out(cloud, nodes, whole, found, reach), reach
 
 
-def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces) -> _Mesh:
+def _coverage(nodes: np.ndarray, faces: Faces) -> float:
+    """Triangles of the largest piece, over the number of a mesh with all nodes."""
+    return float(np.bincount(pieces(faces)).max()) / (2 * len(nodes)) if len(faces) else 0.0
+
+
+def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces, length: float) -> _Mesh:
     """The largest piece of a mesh of nodes in space; all points get places from the nearest node.
 
-    Points next to another piece of the mesh `before` are off the sheet, however near they are.
+    Points of another piece of the mesh `before` are off the sheet, unless that piece is next to it.
     """
     used = in_use(faces, len(nodes))
-    stray = _next_to(cloud, nodes, in_use(before, len(nodes)) & ~used, used)
+    stray = _next_to(cloud, nodes, _separate(nodes, before, used, GAP * length), used)
     nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
     loops = sheet_loops(nodes, faces)
     flat = flat_places(nodes, faces, loops)
     places, away = carried_places(cloud, nodes, faces, flat)
     return _Mesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
+
+
+def _separate(nodes: np.ndarray, faces: Faces, used: np.ndarray, gap: float) -> np.ndarray:
+    """Nodes of other pieces that are farther away than the gap, or large."""
+    from scipy.spatial import cKDTree
+
+    tree, number, found = cKDTree(nodes[used]), pieces(faces), np.zeros(len(nodes), bool)
+    for piece in range(1, int(number.max()) + 1):
+        some = np.unique(faces[number == piece])
+        away = len(some) >= FLOCK or tree.query(nodes[some])[0].min() > gap
+        found[some] = away and not used[some].any()
+    return found
 
 
 def _next_to(cloud: np.ndarray, nodes: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from jaxfit._scan._manifold import (
 )
 
 COMPARABLE = 0.1  # of the area of the largest piece: a second one is no stray
-LEAST_OPENING = 0.1  # of the perimeter of a flat disc of this area: a shorter rim is a gap in a closed surface
+LEAST_OPENING = 0.1  # of the perimeter of a flat disc of this area: a shorter rim is a gap in a sphere
 TUBE_ENDS = 0.5  # least ratio of the areas of two loops that may be the ends of a tube
 TUBE_AREA = 2.0  # least area of a tube, times the difference of these
 REMEDY = "cut the points and fit the parts"
@@ -36,13 +36,14 @@ def largest_piece(points: Float[Any, "points 3"], faces: Faces) -> Faces:
     second = float(np.sort(area)[-2]) if len(area) > 1 else 0.0
     if second > COMPARABLE * area[largest]:
         raise ValueError(
-            f"points must make one sheet, but make several pieces, the second with {second / area[largest]:.0%}"
-            " of the area of the first; fit each on its own, or raise hole_length to bridge the gap."
+            f"points must make one sheet, but make several pieces, the second with "
+            f"{second / area[largest]:.0%} of the area of the first; fit each on its own, "
+            "or raise hole_length to bridge the gap."
         )
     return faces[piece == largest]
 
 
-def sheet_loops(points: Float[Any, "points 3"], faces: Faces) -> list[Int[np.ndarray, " loop"]]:
+def sheet_loops(points: Float[Any, "points 3"], faces: Faces) -> list[Int[np.ndarray, " _"]]:
     """The boundary loops of one piece, the rim first; raises ValueError if it is no disc with holes."""
     loops = sorted(boundary_loops(faces), key=lambda x: -perimeter(points[x]))
     area = float(areas(points, faces).sum())

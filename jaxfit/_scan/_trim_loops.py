@@ -13,6 +13,7 @@ from jaxfit._splines import BSplineSurface
 
 SMOOTHED = 0.5  # of the spacing: notches of the rim this narrow are closed
 STRAIGHT = 0.02  # of the spacing: vertices this near to the line between others are dropped
+LEAST_HOLE = 0.25  # times the squared hole length: smaller ones are gaps between triangles
 LEAST_AREA = 1e-9  # of the mean: smaller triangles cover nothing
 LONGEST = 2.0  # times the spacing: longer edges are divided
 
@@ -35,7 +36,8 @@ def trim_loops(
     reach, least = SMOOTHED * sheet.spacing, STRAIGHT * sheet.spacing
     region = _largest(region.buffer(reach).buffer(-reach).simplify(least).buffer(least + sheet.outset))
     region = _largest(region.intersection(shapely.box(0.0, 0.0, *sides)))
-    holes = [x for x in region.interiors if shapely.Polygon(x).area > (sheet.hole_length / sheet.size) ** 2 / 4]
+    smallest = LEAST_HOLE * (sheet.hole_length / sheet.size) ** 2
+    holes = [x for x in region.interiors if shapely.Polygon(x).area > smallest]
     region = shapely.Polygon(region.exterior, holes).segmentize(LONGEST * sheet.spacing)
     region = shapely.orient_polygons(region)
     rings = [np.asarray(x.coords)[:-1] for x in (region.exterior, *region.interiors)]
