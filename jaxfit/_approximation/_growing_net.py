@@ -63,8 +63,8 @@ class NetGrowth:
                 return level, RESULTS.converged
             if best is not None and not level.held_out < BETTER * best.held_out:
                 return best, RESULTS.noise_reached
-            best, size = level, size * self._growth(level.fit)
-            if size > self.most:
+            best, before_size, size = level, size, size * self._growth(level.fit)
+            if size > self.most or self.net(size) == self.net(before_size):
                 return best, RESULTS.net_exhausted
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 

@@ -10,6 +10,8 @@ from jaxfit._base import Boundary, carried_base, free_base, net_of_ratio, net_of
 from jaxfit._scan import Sheet
 from jaxfit._splines import BSplineSurface
 
+MOST_SIZE = 96  # control points along either direction of a sheet, which may be rough at all scales
+
 Feet = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
 
@@ -57,7 +59,8 @@ class SheetNets(AbstractNets):
 
     def net(self, size: float, most: int) -> tuple[int, int]:
         """Shared between the directions by the sides of the sheet laid out flat."""
-        return net_of_ratio(size, float(np.sqrt(self.sheet.sides[0] / self.sheet.sides[1])), self.order, most)
+        ratio = float(np.sqrt(self.sheet.sides[0] / self.sheet.sides[1]))
+        return net_of_ratio(size, ratio, self.order, min(most, MOST_SIZE))
 
     def base(self, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface."""
