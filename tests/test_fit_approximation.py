@@ -366,11 +366,6 @@ def test_an_option_that_there_is_none_gets_a_sentence():
         jf.fit_points(POINTS, BOUNDARY, tolerance=1e-4)
 
 
-def test_a_cloud_without_a_boundary_gets_a_sentence():
-    with pytest.raises(ValueError, match="boundary must be given"):
-        jf.fit_points(POINTS)
-
-
 @pytest.mark.parametrize(
     ("name", "net", "average"),
     [("igea_face", (42, 42), 3e-4)],

@@ -21,6 +21,7 @@ ROOMS = [
     ("_closest",),
     ("_normal_equations",),
     ("_base",),
+    ("_scan",),
     ("_quality",),
     ("_trimmed",),
     ("_fit",),

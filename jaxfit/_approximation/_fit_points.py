@@ -8,9 +8,20 @@ from jax.typing import ArrayLike
 
 from jaxfit._approximation._approximate import LEAST_POINTS, approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._checked_scan import checked_scan
+from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
-from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net
+from jaxfit._approximation._level_nets import BoundaryNets
+from jaxfit._base import (
+    AbstractBaseMethod,
+    Boundary,
+    Coons,
+    base_surface,
+    checked_net,
+    default_base,
+    default_net,
+)
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
@@ -24,14 +35,21 @@ def fit_points(
     order: tuple[int, int] = (4, 4),
     method: AbstractIterativeMethod | None = None,
     base: Coons | AbstractBaseMethod | None = None,
+    faces: ArrayLike | None = None,
+    hole_length: float | None = None,
     **options: Any,
 ) -> Fit:
-    """Fit a surface to a cloud of points with four boundary polylines: `base_surface`, then `approximate`.
+    """Fit a surface to a cloud of points: with four boundary polylines, or a raw scan.
+
+    With a boundary: `base_surface`, then `approximate`. Without one the points are cleaned and connected by a
+    mesh, whose rim and holes become loops in (u, v). The surface is larger than the sheet by a knot span on
+    each side, smooth where there are no points.
 
     Parameters
     ----------
-    points : array (points, d)
-    boundary : Boundary
+    points : array (points, d); (points, 3) without a boundary
+        In any order and any unit. Without a boundary they may hold duplicates, outliers and NaN.
+    boundary : Boundary, optional
         The four sides of the patch.
     net : (nu, nv), optional
         Control points along u and v, shared between the directions by the lengths of the sides if not given.
@@ -42,20 +60,37 @@ def fit_points(
         Degree + 1 along u and v (default (4, 4)).
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
-        from the points on average, Meshless(), if it is nearer.
+        from the points on average, Meshless(), if it is nearer. Only with a boundary.
+    faces : array of int (faces, 3), optional
+        The triangles of the file that the points come from, as numbers of points. Only without a boundary.
+        Default: the points are connected by their neighbours.
+    hole_length : float, optional
+        In the unit of the points: no triangle is longer, so gaps that are wider are holes. Only without a
+        boundary. Default: twice the distance of the sixth neighbour, of 99 % of the points; given faces are
+        all kept.
     method, options
         As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors.
+        Without a boundary there is no `start`, and `errors` is LocalFeet() by default.
 
     Returns
     -------
     Fit
+        Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
+        `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
+        `feet_on_border`: points on the sheet whose foot is on the border of the domain; `sheet_area`, that of
+        the mesh; and `loops`: closed polylines (vertices, 2) in (u, v), the first vertex not repeated, first
+        the rim, counter-clockwise, then the holes. Points that were left out have errors as well, but do not
+        count; where they are not finite u, v and errors are NaN.
 
     Raises
     ------
     ValueError
-        As `base_surface` and `approximate` do, and if there is no boundary.
+        As `base_surface` and `approximate` do. Without a boundary also if the points make no sheet: a disc,
+        with or without holes.
     TypeError
         If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
+    ImportError
+        Without a boundary, if shapely (the extra `scan`) is not installed.
 
     Notes
     -----
@@ -67,6 +102,16 @@ def fit_points(
     20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than 20,000 points as
     many as the net needs, 48 for a control point, choose it.
 
+    Without a boundary each point has its Delaunay star in its own tangent plane, and triangles on which
+    stars agree make the mesh. It is laid out flat with little distortion and no flipped triangle (symmetric
+    Dirichlet energy), and the smallest rectangle around it becomes the domain. The base surface is a thin
+    plate at these parameters with a free border, and a border held by the method stays where the plate put
+    it, beyond the points. Clouds that are level, but too rough for neighbours to agree on a surface, as a
+    survey of a town from the air, are laid out by their principal plane instead, the mesh over medians of
+    their heights. Fails where two sheets are nearer to each other than their points, for closed surfaces,
+    tubes and several pieces, and where noise is coarser than the points are dense and the cloud is not level.
+    Of more than 30,000 points an even choice makes the mesh, and faces are not used.
+
     Examples
     --------
     >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
@@ -74,20 +119,30 @@ def fit_points(
     >>> fit = jf.fit_points(grid.reshape(-1, 3), jf.Boundary.from_grid(grid), net=(6, 5), max_steps=3)
     >>> bool(fit.converged), bool(fit.average_error < 6e-4)
     (True, True)
+
+    Without the boundary:
+
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 12), indexing="ij")
+    >>> fit = jf.fit_points(np.stack([x, y, x * y], axis=2).reshape(-1, 3), net=(8, 7))
+    >>> bool(fit.average_error < 6e-4), fit.stats["outliers"], len(fit.stats["loops"])
+    (True, 0, 1)
     """
     _check_names(options)
     check_order(order)
     if boundary is None:
-        raise ValueError(
-            "boundary must be given for scattered points; pass boundary=Boundary(v0, v1, u0, u1), the "
-            "four polylines around the patch."
-        )
+        return _without_boundary(points, faces, hole_length, net, order, method, base, options)
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
+    for name, value in (("faces", faces), ("hole_length", hole_length)):
+        if value is not None:
+            raise ValueError(
+                f"{name} must be None where there is a boundary, which says where the patch ends; leave out "
+                "either."
+            )
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     checked_request(cloud, method=method, **options)
     if net is None and _may_grow(cloud, method, options):
         request = _DEFAULTS | options
-        growth = NetGrowth(np.asarray(cloud), boundary, order, default_method(method), request)
+        growth = NetGrowth(np.asarray(cloud), BoundaryNets(boundary, order), default_method(method), request)
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
     return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
@@ -97,6 +152,26 @@ def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int
     if base is None and is_concrete(cloud):
         return default_base(boundary, np.asarray(cloud), net, order)
     return base_surface(boundary, cloud, net=net, order=order, method=base)
+
+
+def _without_boundary(
+    points: Any,
+    faces: Any,
+    hole_length: Any,
+    net: Any,
+    order: tuple[int, int],
+    method: Any,
+    base: Any,
+    options: dict[str, Any],
+) -> Fit:
+    scan = checked_scan(points, faces, hole_length, base, options.get("start"))
+    finite = np.isfinite(scan.points).all(axis=1)
+    if finite.any():  # or else `fit_scan` says what is wrong
+        whole = np.where(finite[:, None], scan.points, scan.points[np.argmax(finite)])
+        checked_request(whole, method=method, **options)
+    net = None if net is None else checked_net(net, order)
+    grows = net is None and _may_grow(scan.points[finite], method, options)
+    return fit_scan(scan, net, order, method, _DEFAULTS | options, grows)
 
 
 def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:

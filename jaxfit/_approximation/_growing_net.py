@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._approximate import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
-from jaxfit._base import Boundary, carried_base, net_of_size
+from jaxfit._approximation._level_nets import AbstractNets
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._splines import BSplineSurface
@@ -41,13 +41,11 @@ class NetGrowth:
     def __init__(
         self,
         points: Float[np.ndarray, "points d"],
-        boundary: Boundary,
-        order: tuple[int, int],
+        nets: AbstractNets,
         method: Any,
         request: dict[str, Any],
     ):
-        self.points, self.boundary, self.order, self.method = points, boundary, order, method
-        self.request = request
+        self.points, self.nets, self.method, self.request = points, nets, method, request
         given = request["weights"]
         self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
         counted = np.flatnonzero(self.weights > 0)
@@ -57,7 +55,7 @@ class NetGrowth:
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
-        return net_of_size(size, self.boundary, self.order, MOST_SIZE)
+        return self.nets.net(size, MOST_SIZE)
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
@@ -68,21 +66,21 @@ class NetGrowth:
                 return level, RESULTS.converged
             if best is not None and not level.held_out < BETTER * best.held_out:
                 return best, RESULTS.noise_reached
-            best, size = level, size * self._growth(level.fit)
-            if size > self.most:
+            best, coarser, size = level, size, size * self._growth(level.fit)
+            if size > self.most or self.net(size) == self.net(coarser):
                 return best, RESULTS.net_exhausted
-            base, before = self.carried(level.fit.surface, size), level
-
-    def carried(self, surface: BSplineSurface, size: float) -> BSplineSurface:
-        """`surface` with another net."""
-        return carried_base(surface, self.boundary, self.net(size), self.order)
+            base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 
     def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
         some, held_out = self._chosen(size)
-        same = before is not None and len(before.fit.u) == len(some)
+        start, feet = None, self.nets.feet(self.net(size))
+        if feet is not None:
+            start = feet[0][some], feet[1][some]
+        elif before is not None and len(before.fit.u) == len(some):
+            start = before.fit.u, before.fit.v
         request = self.request | {
             "weights": np.where(held_out, 0.0, self.weights[some]),
-            "start": (before.fit.u, before.fit.v) if before is not None and same else None,
+            "start": start,
             "max_steps": min(LEVEL_STEPS, self.request["max_steps"]),
             "throw": False,
             "errors": LocalFeet(),
@@ -112,15 +110,18 @@ class NetGrowth:
 def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     """The fit with a net of the size that the tolerances take, or that the points allow."""
     level, why = growth.grown(base)
-    size, request = level.size, growth.request | {"throw": False, "start": None}
+    size, request = level.size, growth.request | {"throw": False}
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
+    request["start"] = growth.nets.feet(growth.net(size))
     fit = fit_cloud(growth.points, level.fit.surface, growth.method, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= LEAST_GROWTH
         if bool(fit.converged) or size > growth.most:
             break
-        fit = fit_cloud(growth.points, growth.carried(fit.surface, size), growth.method, request)
+        net = growth.net(size)
+        request["start"] = growth.nets.feet(net)
+        fit = fit_cloud(growth.points, growth.nets.carried(fit.surface, net), growth.method, request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit

@@ -10,8 +10,16 @@ from jaxfit._base._coons import Greville as Greville
 from jaxfit._base._coons import Uniform as Uniform
 from jaxfit._base._coons import coons_surface as coons_surface
 from jaxfit._base._default_base import default_base as default_base
+from jaxfit._base._default_net import MOST_CONTROL_POINTS as MOST_CONTROL_POINTS
+from jaxfit._base._default_net import checked_net as checked_net
 from jaxfit._base._default_net import default_net as default_net
+from jaxfit._base._default_net import default_size as default_size
+from jaxfit._base._default_net import net_of_ratio as net_of_ratio
 from jaxfit._base._default_net import net_of_size as net_of_size
+from jaxfit._base._delaunay_stars import Stars as Stars
+from jaxfit._base._delaunay_stars import point_normals as point_normals
+from jaxfit._base._delaunay_stars import stars as stars
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
+from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters

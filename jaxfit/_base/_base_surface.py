@@ -1,7 +1,5 @@
 """The base surface: boundary polylines to curves, curves to a Coons patch (paper section 2.3)."""
 
-import operator
-
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -9,7 +7,7 @@ from jaxfit._base._base_method import AbstractBaseMethod, Coons
 from jaxfit._base._boundary import Boundary, centre_and_size, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
-from jaxfit._base._default_net import default_net
+from jaxfit._base._default_net import checked_net, default_net
 from jaxfit._base._host_splines import halve_widest_spans
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
@@ -20,8 +18,6 @@ from jaxfit._splines import BSplineSurface
 MAX_STEPS = 100  # of the curve fit; few curves use them up
 CLOSE = 0.01  # the curve fit stops when its average error is this much of the tolerance
 FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are split in the middle
-
-LARGEST_NET = 10_000_000  # control points in all: a fit of more would not fit in memory
 
 
 @eager_where_concrete
@@ -187,21 +183,4 @@ def _checked_net(
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")
     check_order(order)
-    if net is None:
-        return None
-    try:
-        nu, nv = (operator.index(x) for x in net)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"net must be two whole numbers, but is {net!r}; give one for u and one for v."
-        ) from error
-    if nu < order[0] or nv < order[1]:
-        raise ValueError(
-            f"net must be at least {order[0]} x {order[1]} control points for order {order}, but "
-            f"is {nu} x {nv}; enlarge it or lower the order."
-        )
-    if nu * nv > LARGEST_NET:
-        raise ValueError(
-            f"net must have at most {LARGEST_NET} control points, but {nu} x {nv} are asked for; lower it."
-        )
-    return nu, nv
+    return None if net is None else checked_net(net, order)

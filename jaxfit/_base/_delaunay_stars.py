@@ -139,6 +139,13 @@ def _planes(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> _Pla
     return _Planes(points, axes[:, :, -2:], normals)
 
 
+def point_normals(points: Float[Any, "points 3"], count: int) -> Float[Any, "points 3"]:
+    """Unit normals of the planes through about `count` neighbours, all to one side of the surface."""
+    normals = _planes(points, *neighbourhoods(points, count)).normals
+    assert normals is not None
+    return normals
+
+
 def _directions(
     points: np.ndarray, rows: np.ndarray, members: np.ndarray, filled: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

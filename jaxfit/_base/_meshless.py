@@ -7,15 +7,12 @@ from jaxtyping import Float
 
 from jaxfit._base._arc_length import along_sides
 from jaxfit._base._base_method import AbstractBaseMethod
-from jaxfit._base._held_border_fit import HeldBorderFit
 from jaxfit._base._host_splines import Knots
 from jaxfit._base._meshless_parameters import parameters_of
 from jaxfit._base._normalised_cloud import Cloud, thinned
-from jaxfit._base._unfolding import unfolded
+from jaxfit._base._smoothed_net import smoothed_net
+from jaxfit._base._thin_plate_fit import ThinPlateFit
 from jaxfit._checks import check_number
-
-FARTHEST = 2.0  # times the reach of the points: how far out control points may lie
-MOST_RISES = 12  # most rises of the smoothing
 
 
 class Meshless(AbstractBaseMethod):
@@ -108,11 +105,6 @@ class Meshless(AbstractBaseMethod):
         points = thinned(cloud.points, self.most_points)
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
         places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
-        most = FARTHEST * max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
-        fit = HeldBorderFit(net, knots, order, places, points)
-        for power in range(MOST_RISES):
-            smoothing = self.smoothing * 10.0**power
-            found, weights = fit.robust_weights(smoothing, self.robust)
-            if np.linalg.norm(found, axis=-1).max() <= most:
-                break
-        return unfolded(fit, found, weights, smoothing) if net.shape[2] == 3 else found
+        reach = max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
+        fit = ThinPlateFit(net, knots, order, places, points)
+        return smoothed_net(fit, self.smoothing, self.robust, reach)

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit._base._held_border_fit import HeldBorderFit
 from jaxfit._base._host_splines import GridEvaluator, Knots
+from jaxfit._base._thin_plate_fit import ThinPlateFit
 
 LEAST_COSINE = 0.3  # cosine of the angle between neighbouring normals from which on they count as a fold
 LEAST_COSINE_CREASED = -0.8  # the same for order 2, whose surfaces may have sharp edges at all knots
@@ -18,7 +18,7 @@ MOST_IDLE_ROUNDS = 3  # rounds in a row without fewer folds before the end
 
 
 def unfolded(
-    fit: HeldBorderFit, net: Float[Any, "nu nv 3"], weights: Float[Any, " points"], smoothing: float
+    fit: ThinPlateFit, net: Float[Any, "nu nv 3"], weights: Float[Any, " points"], smoothing: float
 ) -> Float[Any, "nu nv 3"]:
     """The net with the fewest folds when points in folded cells and around them lose weight, round by round.
 

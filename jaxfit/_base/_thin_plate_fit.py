@@ -1,4 +1,4 @@
-"""Tensor-product least squares with a thin plate, on nets whose border control points are given."""
+"""Tensor-product least squares with a thin plate, on nets whose border control points are given or free."""
 
 from typing import Any
 
@@ -46,26 +46,29 @@ def _derivative_products(knots: np.ndarray, order: int) -> list[Any]:
     return [x.T @ x for x in rows]
 
 
-class HeldBorderFit:
-    r"""The net that minimises $\sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F$, its border as given.
+class ThinPlateFit:
+    r"""The net that minimises $\sum_k w_k |R(u_k, v_k) - Q_k|^2 + \lambda F$.
 
-    F is the thin plate over the unit square; $\lambda$ is `smoothing` times the trace of the matrix of
-    the sum with all w = 1, over that of F. With `smoothing` > 0 there is one solution whatever the points.
+    Its border is that of `start`, or free. F is the thin plate over the unit square; $\lambda$ is `smoothing`
+    times the trace of the matrix of the sum with all w = 1, over that of F. With `smoothing` > 0 there is one
+    solution whatever the points, if the border is given, and with three that are not in line, if it is free.
     """
 
     def __init__(
         self,
-        border: Float[Any, "nu nv d"],
+        start: Float[Any, "nu nv d"],
         knots: Knots,
         order: tuple[int, int],
         places: Float[Any, "points 2"],
         points: Float[Any, "points d"],
+        free_border: bool = False,
     ):
         from scipy.interpolate import BSpline
 
         parts = [BSpline.design_matrix(x, t, k - 1) for t, k, x in zip(knots, order, places.T, strict=True)]
         self.knots, self.order, self.places, self.points = knots, order, places, points
-        self._border = border
+        self._start, self._free = start, np.full(start.shape[:2], free_border)
+        self._free[1:-1, 1:-1] = True
         self._rows, self._plate = _tensor_rows(*parts), _thin_plate_matrix(knots, order)
         self._trace = float((self._rows.data**2).sum())
 
@@ -87,15 +90,13 @@ class HeldBorderFit:
         from scipy.sparse import diags_array
         from scipy.sparse.linalg import splu
 
-        nu, nv, d = self._border.shape
-        inside = np.zeros((nu, nv), bool)
-        inside[1:-1, 1:-1] = True
-        free, held = np.flatnonzero(inside), np.flatnonzero(~inside)
+        nu, nv, d = self._start.shape
+        free, held = np.flatnonzero(self._free), np.flatnonzero(~self._free)
         if not len(free):
-            return self._border
+            return self._start
         normal = self._rows.T @ diags_array(weights) @ self._rows
         system = (normal + smoothing * self._trace / self._plate.diagonal().sum() * self._plate).tocsr()
-        flat = self._border.reshape(-1, d).copy()
+        flat = self._start.reshape(-1, d).copy()
         right = (self._rows.T @ (weights[:, None] * self.points))[free] - system[free][:, held] @ flat[held]
         # Where the plate has no bending (order 2) it leaves a control point without points undecided.
         shift = REGULARISATION * self._trace / len(flat)

@@ -1,0 +1,77 @@
+"""Checks of the arguments of `fit_points` without a boundary."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxfit._approximation._approximate import LEAST_POINTS
+from jaxfit._checks import as_points, check_number, is_concrete
+
+
+class ScanInput(NamedTuple):
+    """Points that may not be finite, triangles between them, and what counts as a hole."""
+
+    points: np.ndarray  # (points, 3), float64
+    faces: np.ndarray | None  # (faces, 3)
+    hole_length: float | None
+
+
+def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: Any) -> ScanInput:
+    """The arguments on the host; raises if one is not valid."""
+    if not is_concrete(points, faces, hole_length):
+        raise TypeError(
+            "points must be concrete where no boundary is given, but are traced; call fit_points outside jit."
+        )
+    if base is not None:
+        raise ValueError(
+            f"base must be None where no boundary is given, but is {base!r}; leave it out or pass a boundary."
+        )
+    if start is not None:
+        raise ValueError(
+            "start must be None where no boundary is given, for parameters are found from the points; leave "
+            "it out, or pass a boundary."
+        )
+    cloud = _points_with_gaps(points)
+    if hole_length is not None:
+        check_number("hole_length", hole_length, 0.0)
+        if not hole_length > 0:
+            raise ValueError(
+                f"hole_length must be positive, but is {hole_length!r}; give a length in the points' unit."
+            )
+    return ScanInput(
+        cloud,
+        None if faces is None else _checked_faces(faces, len(cloud)),
+        None if hole_length is None else float(hole_length),
+    )
+
+
+def _points_with_gaps(points: Any) -> np.ndarray:
+    """Points (N, 3) of which some may be NaN or infinite."""
+    array = points
+    if isinstance(points, (list, tuple, np.ndarray, jax.Array)) and not np.ma.isMaskedArray(points):
+        try:
+            array = np.asarray(points)
+        except ValueError:
+            array = points  # rows that differ in length: `as_points` says so
+    gaps = np.zeros(np.shape(array) if isinstance(array, np.ndarray) else (), bool)
+    if isinstance(array, np.ndarray) and array.dtype.kind == "f":
+        gaps = ~np.isfinite(array)
+        array = np.where(gaps, 0.0, array)
+    checked = np.asarray(as_points("points", array, 3, least=LEAST_POINTS), float)
+    return np.where(gaps, np.nan, checked) if gaps.any() else checked
+
+
+def _checked_faces(faces: Any, count: int) -> np.ndarray:
+    numbers = np.asarray(faces)
+    if numbers.dtype.kind not in "iu" or numbers.ndim != 2 or numbers.shape[1] != 3 or not len(numbers):
+        raise ValueError(
+            f"faces must hold three whole numbers a row, but have shape {numbers.shape} and dtype "
+            f"{numbers.dtype}; give the numbers of the corners of each triangle."
+        )
+    if numbers.min() < 0 or numbers.max() >= count:
+        raise ValueError(
+            f"faces must hold numbers of points from 0 to {count - 1}, but hold {numbers.min()} to "
+            f"{numbers.max()}; number the points from 0."
+        )
+    return numbers.astype(int)

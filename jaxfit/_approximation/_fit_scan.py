@@ -1,0 +1,77 @@
+"""`fit_points` without a boundary: a sheet, a surface larger than it with a free border, and its loops."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxfit._approximation._approximate import default_method, fit_cloud
+from jaxfit._approximation._checked_scan import ScanInput
+from jaxfit._approximation._errors import LocalFeet
+from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
+from jaxfit._approximation._level_nets import SheetNets
+from jaxfit._base import MOST_CONTROL_POINTS, default_size
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._result import Fit
+from jaxfit._scan import Layout, Sheet, sheet_of, trim_loops
+
+Order = tuple[int, int]
+
+
+def fit_scan(
+    scan: ScanInput,
+    net: tuple[int, int] | None,
+    order: Order,
+    method: AbstractIterativeMethod | None,
+    request: dict[str, Any],
+    grows: bool,
+) -> Fit:
+    """The fit of the points on the sheet; all others get weight 0, and NaN where they are not finite."""
+    points = scan.points
+    sheet = sheet_of(points, scan.faces, scan.hole_length)
+    finite = np.isfinite(points).all(axis=1)
+    given = np.ones(len(points)) if request["weights"] is None else np.asarray(request["weights"], float)
+    weights = np.zeros(len(points))
+    on_sheet = sheet.number[sheet.on_sheet]
+    weights[on_sheet] = given[on_sheet]
+    errors = LocalFeet() if request["errors"] is None else request["errors"]
+    request = request | {"weights": weights[finite], "errors": errors}
+    cloud, nets, method = points[finite], SheetNets(sheet, order), default_method(method)
+    if net is None and grows:
+        growth = NetGrowth(cloud, nets, method, request)
+        fit = fit_growing(growth, nets.base(growth.net(FIRST_SIZE)))
+        net = fit.surface.shape
+    else:
+        net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
+        fit = fit_cloud(cloud, nets.base(net), method, request | {"start": nets.feet(net)})
+    return _with_loops(_for_all(fit, finite), sheet, sheet.layout(net, order))
+
+
+def _for_all(fit: Fit, finite: np.ndarray) -> Fit:
+    """With NaN for points that are not finite."""
+    if finite.all():
+        return fit
+    arrays = {}
+    for name in ("u", "v", "errors"):
+        some = np.asarray(getattr(fit, name))
+        arrays[name] = np.full(len(finite), np.nan, some.dtype)
+        arrays[name][finite] = some
+    return dataclasses.replace(fit, **jax.device_put(arrays))
+
+
+def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
+    """With the rim and the holes in the parameters of its surface, and what was found on the way."""
+    feet = np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1)[sheet.number]
+    loops = trim_loops(fit.surface, sheet, layout.sides, feet)
+    domain = [tuple(float(x) for x in limits) for limits in fit.surface.domain]
+    on_border = np.any([np.isin(x, limits) for x, limits in zip(feet.T, domain, strict=True)], axis=0)
+    found = {
+        **sheet.counts,
+        "holes": len(loops) - 1,
+        "hole_length": sheet.hole_length,
+        "sheet_area": sheet.area,
+        "feet_on_border": int((on_border & sheet.on_sheet).sum()),
+        "loops": loops,
+    }
+    return dataclasses.replace(fit, stats=fit.stats | found)

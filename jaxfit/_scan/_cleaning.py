@@ -1,0 +1,75 @@
+"""Which points of a scan are left out of the sheet, and why."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+NEIGHBOURS = 16
+PLANES = 4  # times the plane through the neighbours is laid; each time, those far from it count less
+FAR = 4.0  # times the usual distance of neighbours: a point with nobody near
+OFF_USUAL = 8.0  # times the median height of the neighbours over their own planes,
+OFF_MOST = 4.0  # times what four in five of them stay below,
+OFF_SPACING = 0.4  # times the distance of neighbours: all three for a point off the plane of its neighbours
+ROUNDING = 1e-9  # of the diagonal: a height so small is none
+BLOCK = 1 << 15  # points at once
+
+
+class Cleaned(NamedTuple):
+    """Numbers of the points that are kept, and how many are not."""
+
+    kept: Int[np.ndarray, " kept"]
+    non_finite: int
+    duplicates: int
+    outliers: int
+
+
+def cleaned(points: Float[Any, "points 3"]) -> Cleaned:
+    """Without points that are not finite, exact duplicates and outliers.
+
+    An outlier has no neighbours within several times the usual distance, or lies off the plane of its
+    neighbours: by much more than they lie off theirs. An edge is no outlier, for there neighbours lie off
+    their planes as well.
+    """
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    _, first = np.unique(points[finite], axis=0, return_index=True)
+    distinct = finite[np.sort(first)]
+    kept = distinct
+    if len(distinct) > NEIGHBOURS:
+        kept = distinct[~_outliers(points[distinct])]
+    return Cleaned(kept, len(points) - len(finite), len(finite) - len(distinct), len(distinct) - len(kept))
+
+
+def _outliers(points: np.ndarray) -> Bool[np.ndarray, " points"]:
+    from scipy.spatial import cKDTree
+
+    middle = points - points.mean(axis=0)
+    distance, near = cKDTree(middle).query(middle, NEIGHBOURS + 1)
+    near, reach = near[:, 1:], distance[:, NEIGHBOURS // 3 + 1]
+    blocks = np.split(near, range(BLOCK, len(near), BLOCK))
+    starts = range(0, len(near), BLOCK)
+    height = np.concatenate(
+        [_heights(middle[k : k + BLOCK], middle[x]) for k, x in zip(starts, blocks, strict=True)]
+    )
+    usual, most, spacing = (
+        np.concatenate([np.quantile(x[part], share, axis=1) for part in blocks])
+        for x, share in ((height, 0.5), (height, 0.8), (reach, 0.5))
+    )
+    least = ROUNDING * np.linalg.norm(np.ptp(middle, axis=0))
+    off = (height > OFF_USUAL * usual) & (height > OFF_MOST * most) & (height > OFF_SPACING * spacing + least)
+    return off | (reach > FAR * spacing + least)
+
+
+def _heights(points: Float[Any, "points 3"], near: Float[Any, "points near 3"]) -> Float[Any, " points"]:
+    """How far each point is from the plane through its neighbours, those far from the plane counting less."""
+    weight = np.ones(near.shape[:2])
+    least = ROUNDING * np.abs(near).max() + np.finfo(float).tiny
+    for _ in range(PLANES):
+        centre = np.sum(weight[..., None] * near, axis=1) / weight.sum(axis=1, keepdims=True)
+        steps = near - centre[:, None]
+        covariance = np.swapaxes(steps * weight[..., None], 1, 2) @ steps
+        normal = np.linalg.eigh(covariance)[1][:, :, :1]
+        height = np.abs(steps @ normal)[..., 0]
+        usual = np.median(height, axis=1, keepdims=True)
+        weight = 1 / (1 + (height / np.maximum(2 * usual, least)) ** 2) ** 2
+    return np.abs(np.sum((points - centre) * normal[..., 0], axis=1))

@@ -1,0 +1,49 @@
+"""A mesh of scattered points in space: triangles on which the Delaunay stars of their corners agree."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxfit._base import Stars, point_normals, stars
+from jaxfit._scan._manifold import Faces, longest_edges, manifold
+
+NEIGHBOURS = 16  # of a point, among which its star is searched
+WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
+
+
+def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_votes: int = 2) -> Faces:
+    """Oriented triangles between the points, without edges longer than `length`.
+
+    Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
+    flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
+    come first, then those in at least `least_votes` that fit in between, the shortest first. On an exact grid
+    that is bent both halves of a square may be in one star each; among noise such triangles make bridges.
+    """
+    star = stars(points, NEIGHBOURS, fixed=len(points))
+    normals = point_normals(points, NEIGHBOURS)
+    faces, votes = _candidates(star)
+    longest = longest_edges(points, faces)
+    chosen = (longest <= length) & (votes >= least_votes)
+    faces, votes, longest = faces[chosen], votes[chosen], longest[chosen]
+    faces = faces[np.lexsort((longest, -votes))]
+    return manifold(_oriented(points, normals, faces))
+
+
+def _candidates(star: Stars) -> tuple[Faces, Int[np.ndarray, " faces"]]:
+    """All triangles of all stars, and in how many stars each is."""
+    count = star.filled.sum(axis=1, keepdims=True)
+    following = (np.arange(star.members.shape[1])[None] + 1) % np.maximum(count, 1)
+    after = np.take_along_axis(star.members, following, axis=1)
+    closed = star.filled & (star.angle < WIDEST) & (count > 2)
+    own = np.broadcast_to(np.arange(len(star.members))[:, None], star.members.shape)
+    corners = np.stack([own[closed], star.members[closed], after[closed]], axis=1)
+    faces, votes = np.unique(np.sort(corners, axis=1), axis=0, return_counts=True)
+    return faces, votes
+
+
+def _oriented(points: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Faces:
+    """The triangles, each turned so that its normal agrees with those of its corners."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    up = np.sum(np.cross(b - a, c - a) * normals[faces].sum(axis=1), axis=1) > 0
+    return np.where(up[:, None], faces, faces[:, [0, 2, 1]])

@@ -1,0 +1,40 @@
+"""Places of points that are no nodes: linear around the nearest node."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._scan._manifold import Faces
+
+REACH = 2.0  # longest step from a node, as a multiple of the usual edge
+
+
+def carried_places(
+    points: Float[Any, "points 3"],
+    nodes: Float[Any, "nodes 3"],
+    faces: Faces,
+    flat: Float[Any, "nodes 2"],
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
+    """Places in the plane of all points, and their distances from the nearest nodes."""
+    from scipy.spatial import cKDTree
+
+    away, nearest = cKDTree(nodes).query(points)
+    step = np.einsum("pij,pj->pi", _gradients(nodes, faces, flat)[nearest], points - nodes[nearest])
+    edge = np.median(np.linalg.norm(flat[faces[:, 0]] - flat[faces[:, 1]], axis=1))
+    length = np.linalg.norm(step, axis=1, keepdims=True)
+    step = step * np.minimum(1.0, REACH * edge / np.maximum(length, np.finfo(float).tiny))
+    return flat[nearest] + np.where(away[:, None] > 0, step, 0.0), away
+
+
+def _gradients(nodes: np.ndarray, faces: Faces, flat: np.ndarray) -> Float[np.ndarray, "nodes 2 3"]:
+    """Of the map, the means over the triangles around each node, weighted by area."""
+    edges = np.stack([nodes[faces[:, k]] - nodes[faces[:, 0]] for k in (1, 2)], axis=2)
+    moves = np.stack([flat[faces[:, k]] - flat[faces[:, 0]] for k in (1, 2)], axis=2)
+    area = np.linalg.norm(np.cross(edges[..., 0], edges[..., 1]), axis=1)
+    gradient = moves @ np.linalg.pinv(edges, rcond=1e-3) * area[:, None, None]
+    total, weight = np.zeros((len(nodes), 2, 3)), np.zeros(len(nodes))
+    for k in range(3):
+        np.add.at(total, faces[:, k], gradient)
+        np.add.at(weight, faces[:, k], area)
+    return total / np.maximum(weight, np.finfo(float).tiny)[:, None, None]

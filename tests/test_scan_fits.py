@@ -1,0 +1,152 @@
+"""`fit_points` without a boundary: the surface, its loops, and what the fit says about the points."""
+
+import sys
+
+import jax
+import numpy as np
+import pytest
+from helpers import data, diagonal
+
+import jaxfit as jf
+
+shapely = pytest.importorskip("shapely")
+
+
+def scan(count=900, seed=0):
+    """Points of a wavy sheet over a disc with a hole off its middle."""
+    x, y = np.random.default_rng(seed).uniform(-1, 1, (2, 4 * count))
+    k = np.arange(2 * count) + 0.5
+    radius, angle = np.sqrt(k / len(k)), np.pi * (1 + 5**0.5) * k
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    kept = np.hypot(x - 0.3, y) > 0.25
+    return np.stack([x, y, 0.2 * np.sin(2 * x) * np.cos(3 * y)], axis=1)[kept]
+
+
+def region(fit):
+    """The loops as a polygon."""
+    outer, *holes = fit.stats["loops"]
+    return shapely.Polygon(outer, holes)
+
+
+def share_inside(fit):
+    """Of the finite points, those whose foot is inside the loops."""
+    u, v = np.asarray(fit.u), np.asarray(fit.v)
+    return shapely.contains_xy(region(fit), u, v)[np.isfinite(u)].mean()
+
+
+def trimmed_area(fit, n=400):
+    """The area of the surface inside the loops, on a grid of quadrangles."""
+    at = np.linspace(0, 1, n + 1)
+    grid = np.asarray(fit.surface.grid(at, at))
+    first, second = grid[1:, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, 1:]
+    middle = (at[1:] + at[:-1]) / 2
+    u, v = np.meshgrid(middle, middle, indexing="ij")
+    inside = shapely.contains_xy(region(fit), u, v)
+    return (np.linalg.norm(np.cross(first, second), axis=2) / 2)[inside].sum()
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return jf.fit_points(scan(), net=(12, 12), tol_average=1e-4)
+
+
+def test_a_scan_without_boundary_is_fitted_and_trimmed(fit):
+    assert fit.average_error < 1e-4
+    assert fit.regularity.folds == 0
+    assert region(fit).is_valid
+    assert len(fit.stats["loops"]) == 2
+    assert share_inside(fit) > 0.98
+    assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
+    assert fit.stats["feet_on_border"] == 0
+
+
+def test_loops_have_the_surface_to_their_left(fit):
+    outer, hole = (shapely.LinearRing(x) for x in fit.stats["loops"])
+    assert outer.is_ccw
+    assert not hole.is_ccw
+    assert shapely.Polygon(outer).contains(hole)
+
+
+def test_hole_and_rim_are_where_they_were(fit):
+    outer, hole = (np.asarray(fit.surface(*x.T)) for x in fit.stats["loops"])
+    assert np.allclose(np.hypot(outer[:, 0], outer[:, 1]), 1.0, atol=0.06)
+    assert np.allclose(np.hypot(hole[:, 0] - 0.3, hole[:, 1]), 0.25, atol=0.06)
+
+
+def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
+    points = scan()
+    dirty = np.concatenate(
+        [points[:7], np.full((2, 3), np.nan), points, points[100:103] + np.array([0, 0, 0.5])]
+    )
+    again = jf.fit_points(dirty, net=(12, 12), tol_average=1e-4)
+    assert again.stats["points_read"] == len(points) + 12
+    assert (again.stats["duplicates"], again.stats["non_finite"], again.stats["outliers"]) == (7, 2, 3)
+    assert again.errors.shape == (len(points) + 12,)
+    assert np.isnan(again.errors[7:9]).all()
+    assert np.isfinite(np.delete(np.asarray(again.errors), [7, 8])).all()
+    assert again.maximum_error < 1e-2 < again.errors[-1]
+    at = np.asarray(fit.surface(fit.u, fit.v))
+    away = jf.closest_point(again.surface, at).distance
+    assert np.mean(away) < 2e-4 * diagonal(points)
+
+
+def test_results_are_in_the_frame_of_the_points(fit):
+    offset = np.array([5e5, 5.4e6, 100.0])
+    moved = jf.fit_points(100 * scan() + offset, net=(12, 12), tol_average=1e-4)
+    place = np.asarray(moved.surface(moved.u, moved.v))
+    assert np.abs(place - (100 * scan() + offset)).max() < 1.0
+    assert np.isclose(moved.stats["hole_length"], 100 * fit.stats["hole_length"], rtol=1e-6)
+
+
+def test_a_longer_hole_length_closes_the_hole():
+    fit = jf.fit_points(scan(), net=(12, 12), hole_length=0.6, max_steps=1)
+    assert fit.stats["holes"] == 0
+    assert fit.stats["hole_length"] == pytest.approx(0.6)
+
+
+def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
+    points = data("deepdrawing_cup")["points"]
+    fit = jf.fit_points(points, net=(33, 33))
+    assert fit.average_error <= 6.4e-4
+    assert fit.maximum_error <= 1.93e-3
+    assert len(fit.stats["loops"]) == 1
+    assert share_inside(fit) >= 0.98
+    assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "sentence"),
+    [
+        ({"base": jf.Coons()}, ValueError, "base must be None where no boundary"),
+        ({"start": (np.zeros(9), np.zeros(9))}, ValueError, "start must be None where no boundary"),
+        ({"hole_length": -1.0}, ValueError, "hole_length must be a number of at least 0"),
+        ({"faces": [[0, 1]]}, ValueError, "faces must hold three whole numbers"),
+        ({"faces": [[0, 1, 10**6]]}, ValueError, "faces must hold numbers of points from 0"),
+        ({"net": (3, 3)}, ValueError, "net must be at least 4 x 4"),
+        ({"points": np.zeros((40, 2))}, ValueError, "points must have 3 coordinates"),
+        ({"points": np.full((40, 3), np.nan)}, ValueError, "points must hold at least 12 distinct"),
+        ({"weights": np.ones(3)}, ValueError, "weights must hold one number"),
+    ],
+)
+def test_wrong_arguments_get_a_sentence(change, error, sentence):
+    with pytest.raises(error, match=sentence):
+        jf.fit_points(**({"points": scan()} | change))
+
+
+def test_faces_with_a_boundary_are_refused():
+    line = np.stack([np.linspace(0, 1, 4), np.zeros(4), np.zeros(4)], axis=1)
+    side = line[:, [1, 0, 2]]
+    boundary = jf.Boundary(line, line + np.array([0, 1, 0]), side, side + np.array([1, 0, 0]))
+    with pytest.raises(ValueError, match="hole_length must be None where there is a boundary"):
+        jf.fit_points(line, boundary, hole_length=1.0)
+
+
+def test_traced_points_get_a_sentence():
+    with pytest.raises(TypeError, match="call fit_points outside jit"):
+        jax.jit(jf.fit_points)(scan())
+
+
+def test_a_missing_library_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "shapely", None)
+    with pytest.raises(ImportError, match=r'pip install "jaxfit-surfaces\[scan\]"'):
+        jf.fit_points(scan())

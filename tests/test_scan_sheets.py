@@ -1,0 +1,127 @@
+"""Points without a boundary: what is left out, what is no sheet, and how a sheet is laid out."""
+
+import numpy as np
+import pytest
+
+from jaxfit._scan import sheet_of
+from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
+
+pytest.importorskip("shapely")
+
+
+def square(n=16, seed=0):
+    """Points of a wavy sheet over the unit square, jittered."""
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    x, y = (a.ravel() + np.random.default_rng(seed).uniform(-0.2, 0.2, n * n) / n for a in (x, y))
+    return np.stack([x, y, 0.1 * np.sin(3 * x) * np.cos(2 * y)], axis=1)
+
+
+def cylinder(length=3.0, around=24):
+    """Points of an open tube of radius 1."""
+    angle, height = np.meshgrid(
+        np.linspace(0, 2 * np.pi, around, endpoint=False),
+        np.linspace(0, length, int(length * around / 6)),
+        indexing="ij",
+    )
+    angle = angle + 0.01 * np.sin(7 * height)
+    return np.stack([np.cos(angle), np.sin(angle), height], axis=2).reshape(-1, 3)
+
+
+def sphere(count=500):
+    """Evenly spread points of the unit sphere."""
+    k = np.arange(count) + 0.5
+    z, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+
+
+def open_torus():
+    """Points of a torus of which a patch is missing: a sheet with a handle."""
+    angles = [np.linspace(0, 2 * np.pi, n, endpoint=False) for n in (48, 20)]
+    turn, around = np.meshgrid(*angles, indexing="ij")
+    radius = 1.0 + 0.4 * np.cos(around)
+    torus = np.stack([radius * np.cos(turn), radius * np.sin(turn), 0.4 * np.sin(around)], axis=2)
+    torus = torus.reshape(-1, 3)
+    return torus[np.linalg.norm(torus - [1.4, 0, 0], axis=1) > 0.6]
+
+
+def test_a_square_sheet_has_one_loop_and_fills_its_rectangle():
+    sheet = sheet_of(square())
+    assert len(sheet.loops) == 1
+    assert sheet.on_sheet.all()
+    layout = sheet.layout((10, 10), (4, 4))
+    assert np.allclose(np.ptp(layout.parameters, axis=0), 1 - 2 / 10, atol=0.05)
+    assert layout.parameters.min() > 0
+    assert layout.parameters.max() < 1
+
+
+def test_what_is_left_out_is_counted():
+    points = square(20)
+    far = points[::60] + np.array([0, 0, 0.4])
+    gaps = np.full((3, 3), np.nan)
+    stray = points[:4] * 0.1 + 5.0
+    sheet = sheet_of(np.concatenate([points, points[:5], far, gaps, stray]))
+    assert sheet.counts["points_read"] == 400 + 5 + 7 + 3 + 4
+    assert sheet.counts["duplicates"] == 5
+    assert sheet.counts["non_finite"] == 3
+    assert sheet.counts["outliers"] + sheet.counts["off_the_sheet"] == 7 + 4
+    assert set(sheet.number[sheet.on_sheet]) == set(range(400))
+
+
+def test_a_hole_wider_than_the_length_is_a_hole():
+    points = square(24)
+    points = points[np.hypot(points[:, 0] - 0.5, points[:, 1] - 0.5) > 0.2]
+    assert len(sheet_of(points).loops) == 2
+    assert len(sheet_of(points, hole_length=0.7).loops) == 1
+
+
+def test_a_sheet_that_overhangs_is_laid_out_without_flips():
+    around, along = np.meshgrid(np.linspace(0, 1.6 * np.pi, 50), np.linspace(0, 1, 12), indexing="ij")
+    roll = np.stack([0.5 * np.cos(around), 0.5 * np.sin(around), along], axis=2).reshape(-1, 3)
+    sheet = sheet_of(roll)
+    assert np.isclose(sheet.sides[0] * sheet.size, 0.8 * np.pi, rtol=0.02)
+    assert np.isclose(sheet.sides[1] * sheet.size, 1.0, rtol=0.02)
+    node = np.argmin(np.linalg.norm(sheet.points[None] - sheet.nodes[:, None], axis=2), axis=1)
+    corners = sheet.places[node][sheet.faces]
+    (a, b), (c, d) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    turn = np.sign(a * d - b * c)
+    assert (turn == turn[0]).all()
+
+
+def test_faces_of_a_file_are_used():
+    points = square(10)
+    sheet = sheet_of(points)
+    again = sheet_of(points, faces=sheet.faces)
+    assert len(again.faces) == len(sheet.faces)
+    assert np.isclose(again.area, sheet.area)
+
+
+def test_units_offsets_and_order_do_not_matter():
+    points = square(14)
+    one, other = sheet_of(points), sheet_of(1e3 * points[::-1] + [5e5, 5e6, 0])
+    assert np.allclose(one.sides, other.sides, rtol=0.02)
+    assert np.isclose(other.area, 1e6 * one.area, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("points", "sentence"),
+    [
+        (cylinder(), "runs round like a tube"),
+        (sphere(), "closed like a sphere"),
+        (np.concatenate([square(), square() + np.array([3.0, 0, 0])]), "several pieces"),
+        (open_torus(), "1 handle "),
+        (square(3), "at least 12"),
+    ],
+    ids=["tube", "sphere", "two pieces", "handle", "few"],
+)
+def test_what_is_no_sheet_is_said(points, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        sheet_of(points)
+
+
+def test_a_band_with_a_twist_of_triangles_is_no_manifold():
+    faces = np.array([[0, 1, 2], [0, 1, 3], [2, 1, 4]])
+    kept = manifold(faces)
+    assert len(kept) == 2
+    assert (pieces(kept) == 0).all()
+    assert len(boundary_loops(kept)) == 1
+    assert areas(np.eye(5)[:, :3], kept).shape == (2,)
