@@ -24,7 +24,7 @@ def scan(count=900, seed=0):
 
 def region(fit):
     """The loops as a polygon."""
-    outer, *holes = fit.stats["loops"]
+    outer, *holes = fit.trimmed.loops
     return shapely.Polygon(outer, holes)
 
 
@@ -54,21 +54,21 @@ def test_a_scan_without_boundary_is_fitted_and_trimmed(fit):
     assert fit.average_error < 1e-4
     assert fit.regularity.folds == 0
     assert region(fit).is_valid
-    assert len(fit.stats["loops"]) == 2
+    assert len(fit.trimmed.loops) == 2
     assert share_inside(fit) > 0.98
     assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
     assert fit.stats["feet_on_border"] == 0
 
 
 def test_loops_have_the_surface_to_their_left(fit):
-    outer, hole = (shapely.LinearRing(x) for x in fit.stats["loops"])
+    outer, hole = (shapely.LinearRing(x) for x in fit.trimmed.loops)
     assert outer.is_ccw
     assert not hole.is_ccw
     assert shapely.Polygon(outer).contains(hole)
 
 
 def test_hole_and_rim_are_where_they_were(fit):
-    outer, hole = (np.asarray(fit.surface(*x.T)) for x in fit.stats["loops"])
+    outer, hole = (np.asarray(fit.surface(*x.T)) for x in fit.trimmed.loops)
     assert np.allclose(np.hypot(outer[:, 0], outer[:, 1]), 1.0, atol=0.06)
     assert np.allclose(np.hypot(hole[:, 0] - 0.3, hole[:, 1]), 0.25, atol=0.06)
 
@@ -109,7 +109,7 @@ def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
     fit = jf.fit_points(points, net=(33, 33))
     assert fit.average_error <= 6.4e-4
     assert fit.maximum_error <= 1.93e-3
-    assert len(fit.stats["loops"]) == 1
+    assert len(fit.trimmed.loops) == 1
     assert share_inside(fit) >= 0.98
     assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
 

@@ -77,10 +77,9 @@ def fit_points(
     Fit
         Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
         `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
-        `feet_on_border`: points on the sheet whose foot is on the border of the domain; `sheet_area`, that of
-        the mesh; and `loops`: closed polylines (vertices, 2) in (u, v), the first vertex not repeated, first
-        the rim, counter-clockwise, then the holes. Points that were left out have errors as well, but do not
-        count; where they are not finite u, v and errors are NaN.
+        `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
+        that of the mesh. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left
+        out have errors as well, but do not count; where they are not finite u, v and errors are NaN.
 
     Raises
     ------
@@ -124,7 +123,7 @@ def fit_points(
 
     >>> x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 12), indexing="ij")
     >>> fit = jf.fit_points(np.stack([x, y, x * y], axis=2).reshape(-1, 3), net=(8, 7))
-    >>> bool(fit.average_error < 6e-4), fit.stats["outliers"], len(fit.stats["loops"])
+    >>> bool(fit.average_error < 6e-4), fit.stats["outliers"], len(fit.trimmed.loops)
     (True, 0, 1)
     """
     _check_names(options)

@@ -15,6 +15,7 @@ from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
 from jaxfit._scan import Layout, Sheet, sheet_of, trim_loops
+from jaxfit._trimmed import TrimmedSurface
 
 Order = tuple[int, int]
 
@@ -72,6 +73,5 @@ def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
         "hole_length": sheet.hole_length,
         "sheet_area": sheet.area,
         "feet_on_border": int((on_border & sheet.on_sheet).sum()),
-        "loops": loops,
     }
-    return dataclasses.replace(fit, stats=fit.stats | found)
+    return dataclasses.replace(fit, stats=fit.stats | found, trimmed=TrimmedSurface(fit.surface, loops))
