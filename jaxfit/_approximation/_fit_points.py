@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._approximation._approximate import LEAST_POINTS, approximate, default_method
+from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net

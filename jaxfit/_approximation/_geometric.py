@@ -23,6 +23,7 @@ from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
 
@@ -144,7 +145,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         check_switches(self, ("single_step", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
-        if not 0 < self.relaxation < most:
+        if is_concrete(self.relaxation) and not 0 < self.relaxation < most:
             raise ValueError(
                 f"relaxation must lie between 0 and {most:.4g}, where the{such} iteration converges, but is "
                 f"{self.relaxation!r}; pass 1, as in the paper, or 1.3."
@@ -281,6 +282,24 @@ class GeometricApproximation(AbstractIterativeMethod):
             momentum = lax.cond(changed, lambda: rest, lambda: momentum)
         state = GeometricState(state.sums, momentum, state.exceeded, state.extrapolation)
         return Iterate(surface, iterate.projection, state, step), history
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: GeometricState, error: Array
+    ) -> Stationarity:
+        """The weighted means around all control points that move vanish."""
+        if self.fairing is not None:
+            raise TypeError(
+                "adjoint must be UnrolledAdjoint() for a method with fairing, whose surfaces do not come to rest; "
+                "pass that, or fairing=None."
+            )
+        if self.local:
+            raise TypeError(
+                "adjoint must be UnrolledAdjoint() for a method with local=True, which leaves some control points "
+                "where they are; pass that, or local=False."
+            )
+        weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
+        held = held_points(self.border, surface.control_points.shape, surface.used)
+        return Stationarity(weight, held)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

@@ -14,7 +14,7 @@ from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import check_kind, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 
 # The scale follows from the distance that this share of the points does not exceed. Of normally distributed
@@ -32,7 +32,7 @@ class AbstractLoss(eqx.Module):
     def __check_init__(self) -> None:
         if self.scale is not None:
             check_number("scale", self.scale, 0.0)
-            if not self.scale > 0:
+            if is_concrete(self.scale) and not self.scale > 0:
                 raise ValueError(
                     f"scale must be greater than 0, but is {self.scale!r}; pass a fraction of the diagonal, "
                     "or None."

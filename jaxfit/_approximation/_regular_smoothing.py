@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._folds import folds_by_cell, near_folds
-from jaxfit._checks import check_number
+from jaxfit._checks import check_number, is_concrete
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -93,6 +93,8 @@ class RegularSmoothing(eqx.Module):
     def __check_init__(self) -> None:
         for name in ("least", "first", "fall", "raised", "most"):
             check_number(name, getattr(self, name), 0.0)
+        if not is_concrete(tuple(getattr(self, x) for x in ("least", "first", "fall", "raised", "most"))):
+            return
         if not 0 < self.least <= self.first <= self.most:
             raise ValueError(
                 "least, first and most must be positive and not decrease, but are "
@@ -119,7 +121,8 @@ class RegularSmoothing(eqx.Module):
     ) -> Roughness:
         """The smoothing term of a step from a surface at which the data term of the objective is `cost`."""
         knots, net = (surface.knots_u, surface.knots_v), jnp.asarray(surface.control_points)
-        distance = jnp.sqrt(cost / jnp.sum(problem.weight)) / problem.diagonal
+        least = jnp.finfo(net.dtype).tiny  # a root of 0 has no derivative
+        distance = jnp.sqrt(jnp.maximum(cost / jnp.sum(problem.weight), least)) / problem.diagonal
         rho = cost / jnp.sum(problem.counted) * jnp.minimum(distance / FINE, 1.0)
         return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 

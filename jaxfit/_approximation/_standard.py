@@ -22,8 +22,9 @@ from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import RegularisedSystem, ThinPlate, make_system
+from jaxfit._normal_equations import RegularisedSystem, ThinPlate, WeightedPlate, make_system
 
 
 class StandardState(eqx.Module):
@@ -185,6 +186,17 @@ class StandardApproximation(AbstractIterativeMethod):
             surface = self.insertion(step, surface, here, problem.counted)
         state = StandardState(state.smoothing, jnp.maximum(state.shift, shift), state.plate)
         return Iterate(surface, here, state, step), history
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: StandardState, error: Array
+    ) -> Stationarity:
+        """Half the gradient of F. A lambda chosen from the data counts as constant."""
+        length = loss_length(self.loss, problem, error)
+        chosen = isinstance(self.smoothing, AbstractSmoothing)
+        smoothing = state.smoothing if chosen else as_smoothing(self.smoothing, error.dtype)
+        penalty = WeightedPlate(plate_of(state.plate, surface), jnp.asarray(smoothing))
+        weight = reweighted(self.loss, length, problem.weight, error)
+        return Stationarity(weight, self.held(surface), penalty)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

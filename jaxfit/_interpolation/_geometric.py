@@ -20,7 +20,7 @@ from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
+from jaxfit._fit._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import (
     AbstractAcceleration,
     FrozenSystem,
