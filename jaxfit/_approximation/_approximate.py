@@ -14,6 +14,7 @@ from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
 from jaxfit._splines import BSplineSurface
 
+
 @eager_where_concrete
 def approximate(
     points: ArrayLike,

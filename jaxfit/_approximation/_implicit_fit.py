@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._approximation._newton_system import newton_preconditioner, solve_differentiably
+from jaxfit._approximation._newton_system import newton_system
 from jaxfit._approximation._polish import PolishedFit, polished
 from jaxfit._approximation._stationarity_residual import (
     StationarityResidual,
@@ -112,10 +112,7 @@ def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs)
     surface = end.surface.moved_to(at_rest.net)
     fixed = lax.stop_gradient(inputs)
     method = eqx.combine(fixed.numbers, rest)
-    factors = newton_preconditioner(
-        method, end.state, surface, end.problem, (here.u, here.v), here.error
-    )
-    factors = eqx.tree_at(lambda f: f.free, factors, at_rest.free)
+    system = newton_system(method, end.state, surface, end.problem, (here.u, here.v), here.error)
 
     def residual(net: Array) -> StationarityResidual:
         method = eqx.combine(inputs.numbers, rest)
@@ -130,7 +127,7 @@ def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs)
         lambda net: residual(net).value,
         at_rest.net,
         solve=lambda _, net: net,
-        tangent_solve=lambda apply, right: solve_differentiably(apply, factors, right, accuracy),
+        tangent_solve=lambda apply, right: system.solved_differentiably(apply, right, accuracy),
     )
     return _outward(end, inputs, at_rest, net, residual(net))
 

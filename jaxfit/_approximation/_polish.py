@@ -9,7 +9,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._damping import within_reach
-from jaxfit._approximation._newton_system import NewtonPreconditioner, newton_preconditioner, solve_newton
+from jaxfit._approximation._newton_system import newton_system
 from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
     stationarity_residual,
@@ -24,13 +24,19 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
 
-ACCURACY = 1e-4  # of the linear systems: the first steps need no more, the last ones are repeated
+ACCURACY, MOST_CYCLES = 1e-3, 3  # of the linear systems of the steps
 REACH = 0.6  # of the distance between control points: the longest move in a step
-SHORTER, SHORTEST = 0.25, 1e-3  # a step that does not lower |G| is taken again by this factor, down to that
+# The ratio of the actual to the predicted work: above GOOD the shift falls, below POOR it rises.
+GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.1, 4.0
+FIRST_SHIFT, TAKEN_BACK, LEAST_SHIFT, MOST_SHIFT = 1e-4, 10.0, 1e-8, 1e2
+GROWTH = 4.0  # of |G| in an accepted step
 
 
 class PolishedFit(eqx.Module):
-    """The surface at rest, its feet, and |G| over the norms of its terms; `free` control points determine G."""
+    """The surface at rest, its feet, and |G| over the norms of its terms.
+
+    `free` are the control points that G determines.
+    """
 
     net: Float[Array, "nu nv d"]
     projection: Projection
@@ -38,14 +44,25 @@ class PolishedFit(eqx.Module):
     stationarity: Float[Array, ""]
 
 
-class _Step(eqx.Module):
+class _Accepted(eqx.Module):
     net: Float[Array, "nu nv d"]
     projection: Projection
-    size: Float[Array, ""]  # |G|
-    goal: Float[Array, ""]
+    value: Float[Array, "nu nv d"]  # G
+    size: Float[Array, ""]  # its norm
     terms: Float[Array, ""]
-    number: Int[Array, ""]
-    failed: Bool[Array, ""]
+    goal: Float[Array, ""]
+
+
+class _State(eqx.Module):
+    """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
+
+    accepted: _Accepted
+    trial: Float[Array, "nu nv d"]
+    predicted: Float[Array, ""]
+    shift: Float[Array, ""]
+    steps: Int[Array, ""]
+    again: Bool[Array, ""]
+    done: Bool[Array, ""]
 
 
 def polished(
@@ -56,65 +73,64 @@ def polished(
     state: Any,
     projection: Projection,
 ) -> PolishedFit:
-    """Newton steps until G is small enough or does not fall any more."""
+    r"""Newton steps until G is small enough or nothing helps any more.
+
+    A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters, and is accepted
+    where $(G_0 + G_1) \cdot \delta P < 0$: that is twice the change of the objective of which G is the gradient,
+    to third order, and needs no such objective. mu is 0 unless steps are rejected.
+    """
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
-    system = newton_preconditioner(
-        method, state, surface, problem, (projection.u, projection.v), projection.error
-    )
-    free = system.free
+    feet = projection.u, projection.v
+    free = newton_system(method, state, surface, problem, feet, projection.error).free
     goal = adjoint.goal(still.dtype)
 
-    def at(net: Array, before: Projection) -> tuple[Projection, Array, Array, Array]:
-        here = _measured(method, problem, surface.moved_to(net), before)
-        feet = feet_in_rows(surface, problem, here.u, here.v)
-        found = stationarity_residual(method, state, surface.moved_to(net), problem, feet, free, still)
-        least = jnp.maximum(goal * found.terms, found.rounding)
-        return here, jnp.sqrt(jnp.sum(found.value**2)), least, found.terms
+    def advance(now: _State) -> _State:
+        old, there = now.accepted, surface.moved_to(now.trial)
+        here = _measured(method, problem, there, old.projection)
+        feet = feet_in_rows(there, problem, here.u, here.v)
 
-    def direction(step: _Step) -> Array:
-        there, here = surface.moved_to(step.net), step.projection
-        factors = newton_preconditioner(method, state, there, problem, (here.u, here.v), here.error)
-        factors = NewtonPreconditioner(factors.factors, free)
-        feet = feet_in_rows(surface, problem, here.u, here.v)
+        def residual(net: Array) -> tuple[Array, Any]:
+            moved = surface.moved_to(net)
+            found = stationarity_residual(method, state, moved, problem, feet, free, still)
+            return found.value, (found.terms, jnp.maximum(goal * found.terms, found.rounding))
 
-        def value(net: Array) -> Array:
-            return stationarity_residual(
-                method, state, surface.moved_to(net), problem, feet, free, still
-            ).value
+        value, apply, (terms, least) = jax.linearize(residual, now.trial, has_aux=True)
+        new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), terms, least)
+        work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
+        good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
+        shift = _next_shift(now, work, good)
 
-        right, apply = jax.linearize(value, step.net)
-        move = solve_newton(apply, factors, -right, ACCURACY)
-        return _shortened(step.net, move)
+        def step() -> tuple[Array, Array]:
+            system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
+            move = _shortened(now.trial, system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES))
+            return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
 
-    def advance(step: _Step) -> _Step:
-        move = direction(step)
+        done = good & ((new.size <= least) | (now.steps >= adjoint.polish_steps))
+        none = (old.net, jnp.zeros_like(work))
+        trial, predicted = lax.cond(good & ~done, step, lambda: none)
+        accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
+        return _State(
+            accepted, trial, predicted, shift, now.steps + good, ~good, done | (shift > MOST_SHIFT)
+        )
 
-        def trial(tried: tuple[Array, _Step]) -> tuple[Array, _Step]:
-            share, _ = tried
-            net = step.net + share * move
-            here, size, least, terms = at(net, step.projection)
-            new = _Step(net, here, size, least, terms, step.number + 1, jnp.asarray(False))
-            return SHORTER * share, new
-
-        def missed(tried: tuple[Array, _Step]) -> Array:
-            share, new = tried
-            return ~(new.size < step.size) & (share >= SHORTEST)
-
-        first = trial((jnp.ones((), still.dtype), step))
-        _, new = lax.while_loop(missed, trial, first)
-        better = new.size < step.size
-        kept = eqx.tree_at(lambda s: s.failed, step, jnp.asarray(True))
-        return jax.tree.map(lambda x, y: jnp.where(better, x, y), new, kept)
-
-    def unfinished(step: _Step) -> Array:
-        return (step.size > step.goal) & ~step.failed & (step.number < adjoint.polish_steps)
-
-    here, size, least, terms = at(still, projection)
-    begin = _Step(still, here, size, least, terms, jnp.asarray(0, jnp.int32), jnp.asarray(False))
-    end = lax.while_loop(unfinished, advance, begin)
+    nothing = jnp.zeros((), still.dtype)
+    first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
+    yes = jnp.asarray(True)
+    begin = _State(first, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes)
+    end = lax.while_loop(lambda now: ~now.done, advance, begin).accepted
     share = end.size / jnp.where(end.terms > 0, end.terms, 1.0)
     return PolishedFit(end.net, end.projection, free, share)
+
+
+def _next_shift(now: _State, work: Array, good: Array) -> Array:
+    """mu of the next step, from the work that this one was predicted to do."""
+    ratio = work / jnp.where(now.predicted < 0, now.predicted, -1.0)
+    factor = jnp.where(ratio > GOOD, LOWERED, jnp.where(ratio < POOR, RAISED, 1.0))
+    fallen = factor * now.shift
+    fallen = jnp.where(fallen < LEAST_SHIFT, 0.0, fallen)
+    taken_back = jnp.maximum(TAKEN_BACK * now.shift, FIRST_SHIFT)
+    return jnp.where(now.again, now.shift, jnp.where(good, fallen, taken_back))
 
 
 def _shortened(net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:

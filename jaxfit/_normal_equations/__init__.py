@@ -1,5 +1,6 @@
 """Normal matrices of least-squares fits as stencils on the net, thin plates, and their solvers."""
 
+from jaxfit._normal_equations._coupled_preconditioner import CoupledPreconditioner as CoupledPreconditioner
 from jaxfit._normal_equations._coupled_preconditioner import coupled_preconditioner as coupled_preconditioner
 from jaxfit._normal_equations._coupled_preconditioner import solve_coupled as solve_coupled
 from jaxfit._normal_equations._coupled_stencil import CoupledStencil as CoupledStencil

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 Operator = Callable[[Array], Array]
 
@@ -13,10 +13,10 @@ SLOW = 0.9  # a cycle that leaves more of the residual than this is the last
 
 
 class GmresSolution(NamedTuple):
-    """An approximate solution, whether the tolerance is met, and the cycles it took."""
+    """An approximate solution, the share of the preconditioned residual that is left, and the cycles it took."""
 
     net: Float[Array, "n m d"]
-    met: Bool[Array, ""]
+    left: Float[Array, ""]
     cycles: Int[Array, ""]
 
 
@@ -37,11 +37,13 @@ def gmres(
     def size(x: Array) -> Array:
         return jnp.sqrt(jnp.sum(precondition(x) ** 2))
 
-    def unfinished(state: tuple[Array, ...]) -> Array:
+    State = tuple[Array, Array, Array, Array, Array]
+
+    def unfinished(state: State) -> Array:
         _, _, left, cycles, slow = state
         return ~slow & (left > goal) & (cycles < most_cycles)
 
-    def cycle(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def cycle(state: State) -> State:
         x, residual, before, cycles, _ = state
         moved = x + gmres_cycle(apply, precondition, residual, restart)
         rest = right - apply(moved)
@@ -54,7 +56,7 @@ def gmres(
     goal = rtol * first
     begin = (jnp.zeros_like(right), right, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
     x, _, left, cycles, _ = lax.while_loop(unfinished, cycle, begin)
-    return GmresSolution(x, left <= goal, cycles)
+    return GmresSolution(x, left / jnp.where(first > 0, first, 1.0), cycles)
 
 
 def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: int) -> Array:
