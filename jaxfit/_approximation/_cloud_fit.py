@@ -1,5 +1,6 @@
 """`fit_cloud`: one fit of a cloud, from checked arguments to its result."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -39,7 +40,7 @@ def fit_cloud(
 ) -> Fit:
     """`approximate`, its options in a dictionary.
 
-    The fit runs on its arguments without their derivatives, which are concrete while only `grad` is around it.
+    The fit runs on its arguments without their derivatives, which are concrete under `grad` alone.
     """
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
@@ -72,7 +73,7 @@ def fit_cloud(
         here = loop.current
         knots = begun.knots_u, begun.knots_v
         end = EndOfFit(together, here.surface, here.state, here.projection, order, unit, knots)
-        surface, known, share = _differentiable(given, end, surface, known)
+        surface, known, unit, share = _differentiable(given, end, surface, known)
         cloud, concrete = given[0], is_concrete(given)
         stats = stats | {"stationarity": share}
     parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete)
@@ -89,13 +90,22 @@ def fit_cloud(
 
 def without_derivatives(tree: Any) -> Any:
     """The tree with `stop_gradient` of its tracers; the rest is left as it is."""
-    return jax.tree.map(lambda x: lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x, tree)
+
+    def value(x: Any) -> Any:
+        if not isinstance(x, jax.core.Tracer):
+            return x
+        x = lax.stop_gradient(x)
+        return x if isinstance(x, jax.core.Tracer) else jax.device_put(np.asarray(x))
+
+    return jax.tree.map(value, tree)
 
 
 def _differentiable(
     given: Any, end: EndOfFit, surface: BSplineSurface, known: Feet
-) -> tuple[BSplineSurface, Feet, Any]:
-    """The fit as a function of what is `given`, and how stationary it is: NaN where that is not known."""
+) -> tuple[BSplineSurface, Feet, Unit, Any]:
+    """The fit as a function of what is `given`: surface, feet, the unit with its diagonal, and how stationary
+    it is: NaN where that is not known.
+    """
     cloud, base, method, request = given
     dtype = end.problem.target.dtype
     numbers, rest = dynamic_fields(method)
@@ -106,21 +116,24 @@ def _differentiable(
         None if weights is None else jnp.asarray(weights, dtype),
         numbers,
         jnp.asarray(base.control_points, dtype),
-        None if start is None else tuple(jnp.asarray(x, dtype) for x in start),
+        None if start is None else (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype)),
     )
     adjoint = request["adjoint"]
     if adjoint is None:
         net = jnp.asarray(end.surface.control_points, dtype)
         net = jnp.asarray(end.unit.outward(net), dtype)
         unknown = jnp.asarray(jnp.nan, dtype)
-        fitted = Fitted(net, *(jnp.asarray(x) for x in known[:3]), unknown)
+        u, v, error = (jnp.asarray(x) for x in known[:3])
+        diagonal = jnp.asarray(end.unit.diagonal, dtype)
+        fitted = Fitted(net, u, v, error, diagonal, unknown)
         fitted = with_implicit_derivative(rest, ImplicitAdjoint(), fitted, end, inputs)
     else:
         fitted = polished_fitted(rest, adjoint, end, inputs)
     nu, nv = surface.shape
     net = fitted.net[:nu, :nv].astype(base.control_points.dtype)
     surface = BSplineSurface(net, surface.knots_u, surface.knots_v)
-    return surface, (fitted.u, fitted.v, fitted.error, known[3]), fitted.stationarity
+    unit = dataclasses.replace(end.unit, diagonal=fitted.diagonal)
+    return surface, (fitted.u, fitted.v, fitted.error, known[3]), unit, fitted.stationarity
 
 
 def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:

@@ -16,7 +16,7 @@ from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
 from jaxfit._approximation._local_region import local_region
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, zero_momentum
-from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
+from jaxfit._checks import Scalar, check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
@@ -107,7 +107,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     """
 
     border: AbstractBorder = FixedBorder()
-    relaxation: float = 1.3
+    relaxation: Scalar = 1.3
     acceleration: Nesterov | None = Nesterov()
     single_step: bool = True
     insertion: KnotInsertion | None = None
@@ -115,9 +115,9 @@ class GeometricApproximation(AbstractIterativeMethod):
     local: bool = False
     loss: Any = None
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 40
-    stall_gain: float = 2e-3
+    stall_gain: Scalar = 2e-3
 
     @classmethod
     def paper(cls, **changes: Any) -> "GeometricApproximation":
@@ -289,13 +289,13 @@ class GeometricApproximation(AbstractIterativeMethod):
         """The weighted means around all control points that move vanish."""
         if self.fairing is not None:
             raise TypeError(
-                "adjoint must be UnrolledAdjoint() for a method with fairing, whose surfaces do not come to rest; "
-                "pass that, or fairing=None."
+                "adjoint must be UnrolledAdjoint() for a method with fairing, whose surfaces do not come to "
+                "rest; pass that, or fairing=None."
             )
         if self.local:
             raise TypeError(
-                "adjoint must be UnrolledAdjoint() for a method with local=True, which leaves some control points "
-                "where they are; pass that, or local=False."
+                "adjoint must be UnrolledAdjoint() for a method with local=True, which leaves some control "
+                "points where they are; pass that, or local=False."
             )
         weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
         held = held_points(self.border, surface.control_points.shape, surface.used)

@@ -1,8 +1,8 @@
 r"""The derivative of a fit by the implicit function theorem: $dP = -(\partial G / \partial P)^{-1}\, dG$.
 
-The fit runs on its inputs without their derivatives. Its result then passes through `with_implicit_derivative`,
-which leaves it as it is, unless it is differentiated: then the surface is polished, and the derivative is
-that of the polished surface in the inputs.
+The fit runs on its inputs without their derivatives. Its result then passes through
+`with_implicit_derivative`, which leaves it as it is, unless it is differentiated: then the surface is
+polished, and the derivative is that of the polished surface in the inputs.
 """
 
 from functools import partial
@@ -47,10 +47,7 @@ class FitInputs(eqx.Module):
 
 
 class EndOfFit(eqx.Module):
-    """How a fit ended, in the unit of the problem, its points indexed by `order`; `base` is what it began from.
-
-    `base` is in the user's unit.
-    """
+    """How a fit ended, in the unit of the problem, its points indexed by `order`."""
 
     problem: Problem
     surface: WorkingSurface
@@ -62,12 +59,13 @@ class EndOfFit(eqx.Module):
 
 
 class Fitted(eqx.Module):
-    """The net and the feet of a fit in the user's unit, and |G| over the norms of its terms."""
+    """The net, the feet and the diagonal in the user's unit, and |G| over the norms of its terms."""
 
     net: Float[Any, "nu nv d"]
     u: Float[Any, " points"]
     v: Float[Any, " points"]
     error: Float[Any, " points"]
+    diagonal: Float[Any, ""]
     stationarity: Float[Any, ""]
 
 
@@ -75,7 +73,10 @@ class Fitted(eqx.Module):
 def with_implicit_derivative(
     rest: Any, adjoint: ImplicitAdjoint, fitted: Fitted, end: EndOfFit, inputs: FitInputs
 ) -> Fitted:
-    """`fitted`, with the derivative of the surface at rest in `inputs`; `rest` are the method's static fields."""
+    """`fitted`, with the derivative of the surface at rest in `inputs`.
+
+    `rest` are the static fields of the method.
+    """
     return fitted
 
 
@@ -150,7 +151,8 @@ def _outward(
         kept = inputs.control_points.astype(net.dtype)  # to the last bit
     net = jnp.where(at_rest.free[:, :, None], moved, kept)
     error = by_point(found.error) * unit.scale
-    return Fitted(net, by_point(found.u), by_point(found.v), error, at_rest.stationarity)
+    diagonal = _problem(end, inputs).diagonal * unit.scale
+    return Fitted(net, by_point(found.u), by_point(found.v), error, diagonal, at_rest.stationarity)
 
 
 def _problem(end: EndOfFit, inputs: FitInputs) -> Problem:

@@ -32,7 +32,7 @@ from jaxfit._approximation._smoothing_term import (
     plate_of,
 )
 from jaxfit._barrier import materialise
-from jaxfit._checks import check_kind, check_number, is_concrete
+from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._feet import measure_feet
@@ -155,12 +155,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
     border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
-    damping: float = 1e-2
-    reach: float = 0.6
+    damping: Scalar = 1e-2
+    reach: Scalar = 0.6
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 20
-    stall_gain: float = 1e-2
+    stall_gain: Scalar = 1e-2
 
     def __check_init__(self) -> None:
         if not isinstance(self.smoothing, RegularSmoothing):

@@ -75,9 +75,9 @@ def polished(
 ) -> PolishedFit:
     r"""Newton steps until G is small enough or nothing helps any more.
 
-    A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters, and is accepted
-    where $(G_0 + G_1) \cdot \delta P < 0$: that is twice the change of the objective of which G is the gradient,
-    to third order, and needs no such objective. mu is 0 unless steps are rejected.
+    A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
+    where $(G_0 + G_1) \cdot \delta P < 0$: to third order that is twice the change of the objective of which G
+    is the gradient, and it needs no such objective. mu is 0 unless steps are rejected.
     """
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
@@ -110,9 +110,7 @@ def polished(
         none = (old.net, jnp.zeros_like(work))
         trial, predicted = lax.cond(good & ~done, step, lambda: none)
         accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
-        return _State(
-            accepted, trial, predicted, shift, now.steps + good, ~good, done | (shift > MOST_SHIFT)
-        )
+        return _State(accepted, trial, predicted, shift, now.steps + good, ~good, done | (shift > MOST_SHIFT))
 
     nothing = jnp.zeros((), still.dtype)
     first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)

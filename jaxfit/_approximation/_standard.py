@@ -14,7 +14,7 @@ from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewt
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, check_switches, is_concrete
+from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._feet import measure_feet
@@ -98,9 +98,9 @@ class StandardApproximation(AbstractIterativeMethod):
     insertion: KnotInsertion | None = None
     loss: Any = None
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 20
-    stall_gain: float = 2e-3
+    stall_gain: Scalar = 2e-3
 
     def __post_init__(self) -> None:
         if not self.parameter_correction:

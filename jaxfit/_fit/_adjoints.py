@@ -63,10 +63,10 @@ class ImplicitAdjoint(AbstractAdjoint):
 
     by one linear solve, whatever the number of iterations was. A fit stops where its errors no longer fall,
     which is before G vanishes, and the derivative there would be wrong by percents. So the surface is first
-    polished: Newton steps on G. The fit that is differentiated, and any fit that `adjoint=ImplicitAdjoint()` is
-    passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms of
-    the terms of G. Read it: above about 1e-6 the surface could not be polished, and the derivative is not to
-    be trusted.
+    polished: Newton steps on G. The fit that is differentiated, and any fit that `adjoint=ImplicitAdjoint()`
+    is passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms
+    of the terms of G. Read it: above about 1e-6 the surface could not be polished, and the derivative is not
+    to be trusted.
 
     Of an interpolation: the derivative at held parameters and knots, $dP = N(\hat u, \hat v)^{-1} dQ$. Any
     parameters at which the surface meets the data solve the interpolation problem, so this is the derivative
@@ -79,7 +79,7 @@ class ImplicitAdjoint(AbstractAdjoint):
         Polishing ends at this relative residual of G, or at rounding (default 1e-12; in single precision
         times the ratio of the rounding units).
     polish_steps : int
-        The largest number of Newton steps (default 20). A step is shortened until |G| falls. 0 leaves the
+        The largest number of Newton steps (default 30). Where they are rejected they are damped. 0 leaves the
         surface as it is. Approximation only.
 
     Raises
@@ -90,12 +90,13 @@ class ImplicitAdjoint(AbstractAdjoint):
     Examples
     --------
     >>> import jaxfit as jf
-    >>> jf.ImplicitAdjoint().residual, jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint()).adjoint.polish_steps
-    (1e-12, 20)
+    >>> adjoint = jf.ImplicitAdjoint()
+    >>> adjoint.residual, adjoint.polish_steps
+    (1e-12, 30)
     """
 
     residual: float = 1e-12
-    polish_steps: int = 20
+    polish_steps: int = 30
 
     def __check_init__(self) -> None:
         check_number("residual", self.residual, 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import Scalar, check_kind, check_number
 from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
@@ -82,7 +82,7 @@ class AbstractIterativeMethod(eqx.Module):
     """
 
     stall_window: eqx.AbstractVar[int]
-    stall_gain: eqx.AbstractVar[float]
+    stall_gain: eqx.AbstractVar[Scalar]
 
     @property
     @abstractmethod

@@ -13,7 +13,7 @@ SLOW = 0.9  # a cycle that leaves more of the residual than this is the last
 
 
 class GmresSolution(NamedTuple):
-    """An approximate solution, the share of the preconditioned residual that is left, and the cycles it took."""
+    """An approximate solution, the share of the residual that is `left`, and the cycles it took."""
 
     net: Float[Array, "n m d"]
     left: Float[Array, ""]
