@@ -76,8 +76,8 @@ def polished(
     r"""Newton steps until G is small enough or nothing helps any more.
 
     A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
-    where $(G_0 + G_1) \cdot \delta P < 0$: to third order that is twice the change of the objective of which G
-    is the gradient, and it needs no such objective. mu is 0 unless steps are rejected.
+    where $(G_0 + G_1) \cdot \delta P < 0$. To third order that is twice the change of the objective of which
+    G is the gradient, and it needs no such objective. mu is 0 unless steps are rejected.
     """
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
