@@ -9,6 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+# A number that may be traced.
+Scalar = float | np.ndarray | jax.Array
+
 LARGEST = 1e150
 LARGEST_COUNT = 2**31 - 2
 LEAST_STEPS = 1e4  # between which the coordinates of a cloud can choose, along its diagonal

@@ -303,18 +303,6 @@ def test_vmap_inside_jit_gives_the_same_as_plain_calls(base):
         assert abs(float(averages[k] - average)) < 1e-12
 
 
-def test_differentiating_through_a_fit_raises_a_sentence(base):
-    start = feet_on(base)
-
-    def height(points):
-        return jf.approximate(
-            points, base, jf.GeometricApproximation(), max_steps=2, tol_average=1e-9, start=start
-        ).average_error
-
-    with pytest.raises(TypeError, match="a fit has no derivative"):
-        jax.jvp(height, (jnp.asarray(POINTS),), (jnp.asarray(POINTS),))
-
-
 def test_a_second_cloud_of_similar_size_compiles_nothing(base):
     jf.approximate(POINTS, base, max_steps=5)
     with count_compilations() as compiled:

@@ -39,25 +39,6 @@ def test_points_of_weight_zero_have_no_influence(base, name):
     assert float(padded.errors[200:].min()) > 0
 
 
-@pytest.mark.parametrize("what", ["smoothing", "weights", "points", "base"])
-def test_a_derivative_that_a_fit_has_not_is_refused(base, what):
-    def height(x):
-        given = dict(points=POINTS, weights=None)
-        surface, smoothing = base, 1e-5
-        if what == "smoothing":
-            smoothing = x[0]
-        elif what == "base":
-            surface = jf.BSplineSurface(base.control_points + x[0], base.knots_u, base.knots_v)
-        else:
-            given[what] = x[0] + (np.ones(200) if what == "weights" else POINTS)
-        method = jf.StandardApproximation(smoothing=smoothing)
-        fit = jf.approximate(given["points"], surface, method, weights=given["weights"], **OPTIONS)
-        return fit.surface(0.3, 0.4)[2]
-
-    with pytest.raises(TypeError, match="no derivative"):
-        jax.grad(height)(jnp.asarray([1e-5]))
-
-
 @pytest.mark.parametrize("name", ["geometric", "orthogonal", "default"])
 def test_a_batch_of_fits_is_the_fits_one_by_one(base, name):
     clouds = jnp.stack([POINTS, POINTS + 0.01, POINTS * 1.02])

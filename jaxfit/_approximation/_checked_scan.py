@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxfit._approximation._approximate import LEAST_POINTS
+from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._checks import as_points, check_number, is_concrete
 
 

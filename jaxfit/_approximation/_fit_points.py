@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxfit._approximation._approximate import LEAST_POINTS, approximate, default_method
+from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._checked_scan import checked_scan
+from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
@@ -179,7 +180,7 @@ def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
     if not is_concrete(cloud, options):
         return False
     weights = options.get("weights")
-    counted = len(cloud) if weights is None else np.count_nonzero(np.asarray(weights) > 0)
+    counted = len(cloud) if weights is None else int(np.count_nonzero(np.asarray(weights) > 0))
     return (
         counted >= LEAST_POINTS_TO_GROW
         and getattr(method, "insertion", None) is None

@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxfit._approximation._approximate import default_method, fit_cloud
+from jaxfit._approximation._approximate import default_method
 from jaxfit._approximation._checked_scan import ScanInput
+from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._level_nets import SheetNets

@@ -16,13 +16,14 @@ from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
 from jaxfit._approximation._local_region import local_region
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, zero_momentum
-from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
+from jaxfit._checks import Scalar, check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
 
@@ -106,7 +107,7 @@ class GeometricApproximation(AbstractIterativeMethod):
     """
 
     border: AbstractBorder = FixedBorder()
-    relaxation: float = 1.3
+    relaxation: Scalar = 1.3
     acceleration: Nesterov | None = Nesterov()
     single_step: bool = True
     insertion: KnotInsertion | None = None
@@ -114,9 +115,9 @@ class GeometricApproximation(AbstractIterativeMethod):
     local: bool = False
     loss: Any = None
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 40
-    stall_gain: float = 2e-3
+    stall_gain: Scalar = 2e-3
 
     @classmethod
     def paper(cls, **changes: Any) -> "GeometricApproximation":
@@ -144,7 +145,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         check_switches(self, ("single_step", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")
-        if not 0 < self.relaxation < most:
+        if is_concrete(self.relaxation) and not 0 < self.relaxation < most:
             raise ValueError(
                 f"relaxation must lie between 0 and {most:.4g}, where the{such} iteration converges, but is "
                 f"{self.relaxation!r}; pass 1, as in the paper, or 1.3."
@@ -281,6 +282,24 @@ class GeometricApproximation(AbstractIterativeMethod):
             momentum = lax.cond(changed, lambda: rest, lambda: momentum)
         state = GeometricState(state.sums, momentum, state.exceeded, state.extrapolation)
         return Iterate(surface, iterate.projection, state, step), history
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: GeometricState, error: Array
+    ) -> Stationarity:
+        """The weighted means around all control points that move vanish."""
+        if self.fairing is not None:
+            raise TypeError(
+                "adjoint must be UnrolledAdjoint() for a method with fairing, whose surfaces do not come to "
+                "rest; pass that, or fairing=None."
+            )
+        if self.local:
+            raise TypeError(
+                "adjoint must be UnrolledAdjoint() for a method with local=True, which leaves some control "
+                "points where they are; pass that, or local=False."
+            )
+        weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
+        held = held_points(self.border, surface.control_points.shape, surface.used)
+        return Stationarity(weight, held)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

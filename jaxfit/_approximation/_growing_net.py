@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._approximation._approximate import fit_cloud
+from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._level_nets import AbstractNets
 from jaxfit._fit._reasons import RESULTS

@@ -14,7 +14,7 @@ from equinox import AbstractClassVar
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 
 # The scale follows from the distance that this share of the points does not exceed. Of normally distributed
@@ -26,13 +26,13 @@ SHARE, DEVIATIONS = 0.9, 1.6449
 class AbstractLoss(eqx.Module):
     """How much a distance counts. `scale` is a fraction of the diagonal."""
 
-    scale: eqx.AbstractVar[float | None]
+    scale: eqx.AbstractVar[Scalar | None]
     width: AbstractClassVar[float]  # the scale in standard deviations, where it follows from the errors
 
     def __check_init__(self) -> None:
         if self.scale is not None:
             check_number("scale", self.scale, 0.0)
-            if not self.scale > 0:
+            if is_concrete(self.scale) and not self.scale > 0:
                 raise ValueError(
                     f"scale must be greater than 0, but is {self.scale!r}; pass a fraction of the diagonal, "
                     "or None."
@@ -87,7 +87,7 @@ class Huber(AbstractLoss):
     ([0.25, 3.0], [1.0, 0.5])
     """
 
-    scale: float | None = None
+    scale: Scalar | None = None
     width: ClassVar[float] = 1.345
 
     def cost(self, square: Array) -> Array:
@@ -125,7 +125,7 @@ class Tukey(AbstractLoss):
     [1.0, 0.25, 0.0]
     """
 
-    scale: float | None = None
+    scale: Scalar | None = None
     width: ClassVar[float] = TUKEY
 
     def cost(self, square: Array) -> Array:
@@ -155,7 +155,7 @@ class GemanMcClure(AbstractLoss):
     [1.0, 0.25, 0.0625]
     """
 
-    scale: float | None = None
+    scale: Scalar | None = None
     width: ClassVar[float] = GEMAN_MCCLURE
 
     def cost(self, square: Array) -> Array:

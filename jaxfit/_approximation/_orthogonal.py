@@ -32,7 +32,7 @@ from jaxfit._approximation._smoothing_term import (
     plate_of,
 )
 from jaxfit._barrier import materialise
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._feet import measure_feet
@@ -40,6 +40,7 @@ from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import AbstractPenalty, ThinPlate, WeightedPlate
 from jaxfit._splines._pieces import pieces_on
@@ -154,12 +155,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
     border: AbstractBorder = FixedBorder()
     insertion: KnotInsertion | None = None
     loss: Any = None
-    damping: float = 1e-2
-    reach: float = 0.6
+    damping: Scalar = 1e-2
+    reach: Scalar = 0.6
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 20
-    stall_gain: float = 1e-2
+    stall_gain: Scalar = 1e-2
 
     def __check_init__(self) -> None:
         if not isinstance(self.smoothing, RegularSmoothing):
@@ -169,12 +170,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")
         check_method(self)
         check_number("damping", self.damping, 0.0)
-        if not 0 < self.damping <= 1:
+        if is_concrete(self.damping) and not 0 < self.damping <= 1:
             raise ValueError(
                 f"damping must be greater than 0 and at most 1, but is {self.damping!r}; the default is 0.01."
             )
         check_number("reach", self.reach, 0.0)
-        if self.reach == 0:
+        if is_concrete(self.reach) and self.reach == 0:
             raise ValueError("reach must be greater than 0, but is 0; the default is 0.6.")
 
     @property
@@ -283,6 +284,20 @@ class OrthogonalDistance(AbstractIterativeMethod):
         damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)
         state = OrthogonalState(damped, penalty, guard, state.smoothing, state.plate)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: OrthogonalState, error: Array
+    ) -> Stationarity:
+        """Half the gradient of F; the factors of RegularSmoothing are those of the last step."""
+        length = loss_length(self.loss, problem, error)
+        if state.guard is None:
+            smoothing = as_smoothing(self.smoothing, error.dtype) * jnp.sum(problem.weight)
+            penalty: AbstractPenalty = WeightedPlate(plate_of(state.plate, surface), smoothing)
+        else:
+            cost = total_cost(self.loss, length, problem.weight, error)
+            penalty = self.smoothing.penalty(state.guard, surface, problem, cost)
+        held = held_points(self.border, surface.control_points.shape, surface.used)
+        return Stationarity(reweighted(self.loss, length, problem.weight, error), held, penalty)
 
     def _refined(self, problem: Problem, iterate: Iterate) -> tuple[WorkingSurface, FoldGuard | None]:
         """The accepted surface, with new knots if it is time; they change neither it nor its feet."""

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._folds import folds_by_cell, near_folds
-from jaxfit._checks import check_number
+from jaxfit._checks import Scalar, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
@@ -84,15 +84,17 @@ class RegularSmoothing(eqx.Module):
     1.0
     """
 
-    least: float = 5.0
-    first: float = 100.0
-    fall: float = 0.7
-    raised: float = 2.0
-    most: float = 1000.0
+    least: Scalar = 5.0
+    first: Scalar = 100.0
+    fall: Scalar = 0.7
+    raised: Scalar = 2.0
+    most: Scalar = 1000.0
 
     def __check_init__(self) -> None:
         for name in ("least", "first", "fall", "raised", "most"):
             check_number(name, getattr(self, name), 0.0)
+        if not is_concrete((self.least, self.first, self.fall, self.raised, self.most)):
+            return
         if not 0 < self.least <= self.first <= self.most:
             raise ValueError(
                 "least, first and most must be positive and not decrease, but are "
@@ -107,7 +109,8 @@ class RegularSmoothing(eqx.Module):
     def begin(self, surface: WorkingSurface) -> tuple["FoldGuard", Roughness]:
         """Before the first step, and in place of a smoothing term nothing."""
         net = surface.control_points
-        factor, floor, zero = (np.full(net.shape[:2], x, net.dtype) for x in (self.first, self.least, 0.0))
+        xp: Any = np if is_concrete(self.first, self.least) else jnp
+        factor, floor, zero = (xp.full(net.shape[:2], x, net.dtype) for x in (self.first, self.least, 0.0))
         folds = np.zeros((surface.axis_u.cells, surface.axis_v.cells), net.dtype)
         knots = surface.knots_u, surface.knots_v
         shapes = jax.eval_shape(lambda: Roughness.of(jnp.asarray(net), *knots, jnp.asarray(factor)))
@@ -119,7 +122,8 @@ class RegularSmoothing(eqx.Module):
     ) -> Roughness:
         """The smoothing term of a step from a surface at which the data term of the objective is `cost`."""
         knots, net = (surface.knots_u, surface.knots_v), jnp.asarray(surface.control_points)
-        distance = jnp.sqrt(cost / jnp.sum(problem.weight)) / problem.diagonal
+        least = jnp.finfo(net.dtype).tiny  # a root of 0 has no derivative
+        distance = jnp.sqrt(jnp.maximum(cost / jnp.sum(problem.weight), least)) / problem.diagonal
         rho = cost / jnp.sum(problem.counted) * jnp.minimum(distance / FINE, 1.0)
         return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 

@@ -14,7 +14,7 @@ from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewt
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._cells import values_at
-from jaxfit._checks import check_kind, check_switches, is_concrete
+from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
 from jaxfit._fit._feet import measure_feet
@@ -22,8 +22,9 @@ from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import RegularisedSystem, ThinPlate, make_system
+from jaxfit._normal_equations import RegularisedSystem, ThinPlate, WeightedPlate, make_system
 
 
 class StandardState(eqx.Module):
@@ -97,9 +98,9 @@ class StandardApproximation(AbstractIterativeMethod):
     insertion: KnotInsertion | None = None
     loss: Any = None
     foot_method: AbstractFootMethod = Newton()
-    foot_tolerance: float = 1e-12
+    foot_tolerance: Scalar = 1e-12
     stall_window: int = 20
-    stall_gain: float = 2e-3
+    stall_gain: Scalar = 2e-3
 
     def __post_init__(self) -> None:
         if not self.parameter_correction:
@@ -185,6 +186,17 @@ class StandardApproximation(AbstractIterativeMethod):
             surface = self.insertion(step, surface, here, problem.counted)
         state = StandardState(state.smoothing, jnp.maximum(state.shift, shift), state.plate)
         return Iterate(surface, here, state, step), history
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: StandardState, error: Array
+    ) -> Stationarity:
+        """Half the gradient of F. A lambda chosen from the data counts as constant."""
+        length = loss_length(self.loss, problem, error)
+        chosen = isinstance(self.smoothing, AbstractSmoothing)
+        smoothing = state.smoothing if chosen else as_smoothing(self.smoothing, error.dtype)
+        penalty = WeightedPlate(plate_of(state.plate, surface), jnp.asarray(smoothing))
+        weight = reweighted(self.loss, length, problem.weight, error)
+        return Stationarity(weight, self.held(surface), penalty)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

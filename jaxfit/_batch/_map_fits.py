@@ -10,8 +10,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._approximation import approximate
-from jaxfit._approximation._approximate import LEAST_POINTS
 from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._batch._broadcast import Request, one_by_one, requests_of
 from jaxfit._batch._failed_fit import failed_fit
 from jaxfit._batch._worker_processes import cores

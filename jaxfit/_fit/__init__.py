@@ -1,5 +1,7 @@
 """What all fits share: the loop, the contract of methods, the history and the result."""
 
+from jaxfit._fit._adjoints import ImplicitAdjoint as ImplicitAdjoint
+from jaxfit._fit._adjoints import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit._border import FixedBorder as FixedBorder
 from jaxfit._fit._border import FixedCorners as FixedCorners
 from jaxfit._fit._border import FixedSides as FixedSides
@@ -13,4 +15,5 @@ from jaxfit._fit._problem import Problem as Problem
 from jaxfit._fit._projection import Projection as Projection
 from jaxfit._fit._reasons import RESULTS as RESULTS
 from jaxfit._fit._result import Fit as Fit
+from jaxfit._fit._stationarity import Stationarity as Stationarity
 from jaxfit._fit._working_surface import WorkingSurface as WorkingSurface

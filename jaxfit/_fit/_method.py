@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-from jaxfit._checks import check_kind, check_number
+from jaxfit._checks import Scalar, check_kind, check_number
 from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
+from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 
 
@@ -81,7 +82,7 @@ class AbstractIterativeMethod(eqx.Module):
     """
 
     stall_window: eqx.AbstractVar[int]
-    stall_gain: eqx.AbstractVar[float]
+    stall_gain: eqx.AbstractVar[Scalar]
 
     @property
     @abstractmethod
@@ -134,6 +135,21 @@ class AbstractIterativeMethod(eqx.Module):
 
         `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate may be better.
         """
+
+    def stationarity(
+        self, problem: Problem, surface: WorkingSurface, state: Any, error: Float[Any, " points"]
+    ) -> Stationarity:
+        """The condition that the method's final surface meets, for the derivative of its fits.
+
+        `state` is the last one, and `error` are the distances of the points, here those of `surface`. It is
+        differentiated with respect to the points, the weights, the control points and the method's numbers,
+        so these have to come from the arguments, not from the state. A method need not have this function;
+        its fits then have no `ImplicitAdjoint`.
+        """
+        raise TypeError(
+            f"adjoint must be UnrolledAdjoint() for {type(self).__name__}, which names no condition that its "
+            "final surface meets; pass that, or give the method a function `stationarity`."
+        )
 
 
 def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:

@@ -1,7 +1,5 @@
 """Surfaces through all points of a grid."""
 
-from jaxfit._interpolation._adjoints import ImplicitAdjoint as ImplicitAdjoint
-from jaxfit._interpolation._adjoints import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import Chebyshev as Chebyshev
 from jaxfit._interpolation._fixed_parameters import Richardson as Richardson
 from jaxfit._interpolation._geometric import GeometricInterpolation as GeometricInterpolation

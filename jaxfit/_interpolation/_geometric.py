@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxfit._checks import check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
+from jaxfit._fit._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import measure_grid, side_bounds
 from jaxfit._fit._history import ErrorHistory
@@ -20,7 +21,6 @@ from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._interpolation._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._interpolation._fixed_parameters import (
     AbstractAcceleration,
     FrozenSystem,

@@ -12,10 +12,10 @@ from jax import Array, lax
 
 from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
+from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._interpolation._adjoints import ImplicitAdjoint
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
 from jaxfit._interpolation._linear_finish import has_stalled, solved_at_grid, with_larger_stall_gain
 from jaxfit._interpolation._method import (

@@ -1,6 +1,4 @@
-"""Restarted GMRES (Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986), preconditioned from the left."""
-
-from collections.abc import Callable
+"""GMRES until the largest error of a grid is small enough, with the errors of every cycle recorded."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,8 +6,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._fit._history import ErrorHistory
-
-Operator = Callable[[Array], Array]
+from jaxfit._normal_equations import Operator, gmres_cycle
 
 SLOW = 0.9  # a cycle that leaves more of the largest error than this is the last
 
@@ -66,37 +63,3 @@ def gmres_solve(
     begin = (x, right - apply(x), step, history, jnp.asarray(False))
     x, _, step, history, _ = lax.while_loop(goes_on, cycle, begin)
     return x, step, history
-
-
-def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: int) -> Array:
-    """One cycle from zero: the x of the Krylov space for which M (right - A x) is smallest.
-
-    Twice classical Gram-Schmidt. An exhausted space adds zero vectors, which the least-squares problem leaves
-    alone.
-    """
-    first = precondition(right).reshape(-1)
-    size = jnp.linalg.norm(first)
-    info = jnp.finfo(right.dtype)
-    basis = (
-        jnp.zeros((restart + 1, first.shape[0]), right.dtype).at[0].set(first / jnp.maximum(size, info.tiny))
-    )
-    projected = jnp.zeros((restart + 1, restart), right.dtype)
-
-    def extend(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        basis, projected = state
-        new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
-        scale = jnp.linalg.norm(new)
-        once = basis @ new
-        new = new - once @ basis
-        twice = basis @ new
-        new = new - twice @ basis
-        length = jnp.linalg.norm(new)
-        fresh = length > 10 * info.eps * scale
-        length = jnp.where(fresh, length, 0.0)
-        basis = basis.at[k + 1].set(jnp.where(fresh, new / jnp.where(fresh, length, 1.0), 0.0))
-        return basis, projected.at[:, k].set((once + twice).at[k + 1].set(length))
-
-    basis, projected = lax.fori_loop(0, restart, extend, (basis, projected))
-    goal = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
-    weights = jnp.linalg.lstsq(projected, goal)[0]
-    return (weights @ basis[:-1]).reshape(right.shape)

@@ -1,0 +1,262 @@
+"""`fit_cloud`: one fit of a cloud, from checked arguments to its result."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+
+from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._errors import AbstractErrors, Feet, GlobalFeet
+from jaxfit._approximation._implicit_fit import (
+    EndOfFit,
+    FitInputs,
+    Fitted,
+    polished_fitted,
+    with_implicit_derivative,
+)
+from jaxfit._checks import as_points, check_kind, is_concrete
+from jaxfit._closest import closest_point
+from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._history import public_history
+from jaxfit._fit._loop import LoopState, begin, run
+from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
+from jaxfit._fit._problem import Problem, Tolerances, make_problem
+from jaxfit._fit._reasons import result_of
+from jaxfit._fit._result import Fit, Name, converged_or_raise
+from jaxfit._fit._scaling import Unit
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._precision import advise_x64, working_dtype
+from jaxfit._splines import BSplineSurface
+
+LEAST_POINTS = 4
+
+
+def fit_cloud(
+    points: ArrayLike, base: BSplineSurface, method: AbstractIterativeMethod, request: dict[str, Any]
+) -> Fit:
+    """`approximate`, its options in a dictionary.
+
+    The fit runs on its arguments without their derivatives, which are concrete under `grad` alone.
+    """
+    check_kind("base", base, BSplineSurface, "base_surface(boundary)")
+    cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
+    dtype = working_dtype()
+    cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
+    given = (cloud, base, method, request)
+    cloud, base, method, request = without_derivatives(given)
+    unit, weight, feet = checked_request(cloud, base.domain, method=method, **request)
+    goals, max_steps = (request["tol_average"], request["tol_maximum"]), request["max_steps"]
+    for tolerance in goals:
+        if tolerance is not None and is_concrete(tolerance):
+            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
+    concrete = is_concrete(cloud, base, weight, request["start"], goals, method)
+    tolerances = _tolerances(*goals, max_steps)
+    problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
+    begun = _working_surface(base, unit, concrete)
+    if feet is None:
+        nearest = closest_point(base, cloud)
+        feet = nearest.u, nearest.v
+    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet)
+    order = _order_by_cell(begun, u, v, cloud.shape[0])
+    if not is_concrete(order):
+        u, v = jnp.asarray(u), jnp.asarray(v)
+    together = problem.ordered(order)
+    loop = begin(method, together, begun, u[order], v[order], max_steps)
+    loop, stats = run(method, together, loop, request["progress"] if concrete else None)
+    surface = _fitted(loop, base, begun, unit)
+    known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
+    if request["adjoint"] is not None or not is_concrete(given):
+        here = loop.current
+        knots = begun.knots_u, begun.knots_v
+        end = EndOfFit(together, here.surface, here.state, here.projection, order, unit, knots)
+        surface, known, unit, share = _differentiable(given, end, surface, known)
+        cloud, concrete = given[0], is_concrete(given)
+        stats = stats | {"stationarity": share}
+    parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete)
+    stats = {
+        "method": Name(type(method).__name__),
+        "num_steps": loop.current.step,
+        "diagonal": unit.diagonal,
+        "unconverged_feet": _sum(~parts[3]),
+        **stats,
+    }
+    fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
+    return converged_or_raise(fit) if request["throw"] else fit
+
+
+def without_derivatives(tree: Any) -> Any:
+    """The tree with `stop_gradient` of its tracers; the rest is left as it is."""
+
+    def value(x: Any) -> Any:
+        if not isinstance(x, jax.core.Tracer):
+            return x
+        x = lax.stop_gradient(x)
+        return x if isinstance(x, jax.core.Tracer) else jax.device_put(np.asarray(x))
+
+    return jax.tree.map(value, tree)
+
+
+def _differentiable(
+    given: Any, end: EndOfFit, surface: BSplineSurface, known: Feet
+) -> tuple[BSplineSurface, Feet, Unit, Any]:
+    """The fit as a function of what is `given`: surface, feet, the unit with its diagonal, and how stationary
+    it is: NaN where that is not known.
+    """
+    cloud, base, method, request = given
+    dtype = end.problem.target.dtype
+    numbers, rest = dynamic_fields(method)
+    numbers = jax.tree.map(lambda x: jnp.asarray(x, dtype) if is_concrete(x) else x.astype(dtype), numbers)
+    weights, start = request["weights"], request["start"]
+    inputs = FitInputs(
+        jnp.asarray(cloud, dtype),
+        None if weights is None else jnp.asarray(weights, dtype),
+        numbers,
+        jnp.asarray(base.control_points, dtype),
+        None if start is None else (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype)),
+    )
+    adjoint = request["adjoint"]
+    if adjoint is None:
+        net = jnp.asarray(end.surface.control_points, dtype)
+        net = jnp.asarray(end.unit.outward(net), dtype)
+        unknown = jnp.asarray(jnp.nan, dtype)
+        u, v, error = (jnp.asarray(x) for x in known[:3])
+        diagonal = jnp.asarray(end.unit.diagonal, dtype)
+        fitted = Fitted(net, u, v, error, diagonal, unknown)
+        fitted = with_implicit_derivative(rest, ImplicitAdjoint(), fitted, end, inputs)
+    else:
+        fitted = polished_fitted(rest, adjoint, end, inputs)
+    nu, nv = surface.shape
+    net = fitted.net[:nu, :nv].astype(base.control_points.dtype)
+    surface = BSplineSurface(net, surface.knots_u, surface.knots_v)
+    unit = dataclasses.replace(end.unit, diagonal=fitted.diagonal)
+    return surface, (fitted.u, fitted.v, fitted.error, known[3]), unit, fitted.stationarity
+
+
+def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:
+    dtype, parts = working_dtype(), []
+    for x in (tol_average, tol_maximum):
+        xp: Any = np if is_concrete(x) else jnp
+        parts.append(xp.asarray(np.inf if x is None else x, dtype))
+    return Tolerances(parts[0], parts[1], np.asarray(max_steps, np.int32))
+
+
+def _working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> WorkingSurface:
+    """The base surface in the unit of the problem."""
+    dtype = working_dtype()
+    xp: Any = np if concrete else jnp
+    net = xp.asarray(unit.inward(base.control_points), dtype)
+    knots_u, knots_v = (
+        np.asarray(x, dtype) if is_concrete(x) else x.astype(dtype) for x in (base.knots_u, base.knots_v)
+    )
+    return WorkingSurface.of(net, knots_u, knots_v)
+
+
+def _padded(x: Any, size: int, dtype: Any) -> Any:
+    """Starting parameters, repeated at the end up to the size of the problem."""
+    xp: Any = np if is_concrete(x) else jnp
+    x = xp.asarray(x, dtype)
+    return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])]) if size > x.shape[0] else x
+
+
+def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
+    """The points sorted by cell, the `count` true ones first.
+
+    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster.
+    """
+    axis_u, axis_v = surface.axes
+    xp: Any = np if is_concrete(surface.axes, u, v) else jnp
+    cells = axis_u.cells * axis_v.cells
+    cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)
+    if u.shape[0] > count:
+        cell = xp.where(np.arange(u.shape[0]) >= count, cells, cell)
+    # Numbers of 16 bits are what NumPy sorts in linear time.
+    return xp.argsort(cell.astype(np.uint16) if cells < 1 << 16 else cell, stable=True)
+
+
+def _fitted(loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit) -> BSplineSurface:
+    """The fitted surface in the user's unit. Control points that have not moved keep every bit.
+
+    Inside transformations a net with room for knots keeps its surplus control points.
+    """
+    end = loop.current.surface
+    concrete = is_concrete(end, base)
+    if concrete and end.control_points.shape != begun.control_points.shape:
+        end = end.trimmed()
+    dtype = base.control_points.dtype
+    xp: Any = np if concrete else jnp  # NumPy compiles nothing
+    moved = xp.asarray(unit.outward(end.control_points), dtype)
+    if moved.shape == base.control_points.shape:
+        still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)
+        moved = xp.where(still, xp.asarray(base.control_points), moved)
+    parts = moved, xp.asarray(end.knots_u, dtype), xp.asarray(end.knots_v, dtype)
+    return BSplineSurface(*(jax.device_put(parts) if concrete else parts))
+
+
+def _in_given_order(loop: LoopState, order: Any, count: int, unit: Unit, concrete: bool) -> Feet:
+    """The last feet, in the order of the points and in the user's unit."""
+    here = loop.current.projection
+    xp: Any = np if concrete else jnp
+    if concrete:  # the inverse of a permutation needs no sort
+        back = np.empty_like(order)
+        back[order] = np.arange(order.size)
+        back = back[:count]
+    else:
+        back = jnp.argsort(order)[:count]
+    u, v, error, converged = (xp.asarray(x)[back] for x in (here.u, here.v, here.error, here.converged))
+    return u, v, error * unit.scale, converged
+
+
+def _at_feet(
+    errors: AbstractErrors | None,
+    surface: BSplineSurface,
+    cloud: Any,
+    known: Feet,
+    at_feet: bool,
+    concrete: bool,
+) -> Feet:
+    """The feet at which the errors are measured."""
+    if not concrete and at_feet:
+        return known
+    return (GlobalFeet() if errors is None else errors).feet(surface, cloud, known, at_feet)
+
+
+def _fit(
+    loop: LoopState,
+    problem: Problem,
+    parts: Feet,
+    unit: Unit,
+    surface: BSplineSurface,
+    stats: dict[str, Any],
+    fairing: Any,
+) -> Fit:
+    """The result. Averages and maxima are over the points of positive weight."""
+    concrete = is_concrete(loop, parts, unit)
+    xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
+    u, v, distance, _ = (xp.asarray(x) for x in parts)
+    relative = distance / unit.diagonal
+    counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
+    average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
+    maximum = xp.max(xp.where(counted, relative, 0.0))
+    arrays: Any = (u, v, relative, average, maximum)
+    if concrete:
+        arrays = jax.device_put([np.asarray(x, problem.target.dtype) for x in arrays])
+    return Fit(
+        surface=surface,
+        u=arrays[0],
+        v=arrays[1],
+        errors=arrays[2],
+        average_error=arrays[3],
+        maximum_error=arrays[4],
+        history=public_history(loop.history, loop.current.step, fairing),
+        result=result_of(loop.code),
+        stats=stats,
+    )
+
+
+def _sum(x: Any) -> Any:
+    xp: Any = np if is_concrete(x) else jnp
+    return xp.sum(xp.asarray(x))

@@ -1,0 +1,200 @@
+r"""The derivative of a fit by the implicit function theorem: $dP = -(\partial G / \partial P)^{-1}\, dG$.
+
+The fit runs on its inputs without their derivatives. Its result then passes through
+`with_implicit_derivative`, which leaves it as it is, unless it is differentiated: then the surface is
+polished, and the derivative is that of the polished surface in the inputs.
+"""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+from jaxfit._approximation._newton_system import newton_system
+from jaxfit._approximation._polish import PolishedFit, polished
+from jaxfit._approximation._stationarity_residual import (
+    StationarityResidual,
+    feet_in_rows,
+    stationarity_residual,
+)
+from jaxfit._closest import as_feet
+from jaxfit._compile import compiled
+from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._scaling import Unit
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._precision import default_foot_tolerance
+from jaxfit._splines._insertion import insertion_weights
+from jaxfit._splines._lookup import windows
+
+# Relative accuracy of the linear system of a derivative, in roots of the rounding unit.
+ACCURACY = 0.75
+
+
+class FitInputs(eqx.Module):
+    """What a fit is differentiated with respect to, in the user's unit; `numbers` are those of the method."""
+
+    points: Float[Array, "points d"]
+    weights: Float[Array, " points"] | None
+    numbers: Any
+    control_points: Float[Array, "nu nv d"]
+    start: tuple[Array, Array] | None
+
+
+class EndOfFit(eqx.Module):
+    """How a fit ended, in the unit of the problem, its points indexed by `order`."""
+
+    problem: Problem
+    surface: WorkingSurface
+    state: Any
+    projection: Projection
+    order: Int[Any, " points"]
+    unit: Unit
+    knots: tuple[Any, Any]  # of the base surface
+
+
+class Fitted(eqx.Module):
+    """The net, the feet and the diagonal in the user's unit, and |G| over the norms of its terms."""
+
+    net: Float[Any, "nu nv d"]
+    u: Float[Any, " points"]
+    v: Float[Any, " points"]
+    error: Float[Any, " points"]
+    diagonal: Float[Any, ""]
+    stationarity: Float[Any, ""]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def with_implicit_derivative(
+    rest: Any, adjoint: ImplicitAdjoint, fitted: Fitted, end: EndOfFit, inputs: FitInputs
+) -> Fitted:
+    """`fitted`, with the derivative of the surface at rest in `inputs`.
+
+    `rest` are the static fields of the method.
+    """
+    return fitted
+
+
+@with_implicit_derivative.defjvp
+def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any) -> Any:
+    _, end, inputs = primals
+    at_rest = polished_fit(rest, adjoint, end, lax.stop_gradient(inputs))
+    return jax.jvp(partial(_implicit, rest, at_rest, end), (inputs,), tangents[2:])
+
+
+def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Fitted:
+    """The polished fit of concrete inputs."""
+    return _implicit(rest, polished_fit(rest, adjoint, end, inputs), end, inputs)
+
+
+@partial(compiled, static_argnums=(0, 1))
+def polished_fit(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
+    """`polished`; on a CPU the fits of a batch one after the other."""
+
+    def whole(end: EndOfFit, inputs: FitInputs) -> PolishedFit:
+        method = eqx.combine(inputs.numbers, rest)
+        return polished(method, adjoint, end.problem, end.surface, end.state, end.projection)
+
+    if jax.default_backend() == "cpu":
+        whole = jax.custom_batching.sequential_vmap(whole)
+    return whole(end, inputs)
+
+
+@partial(compiled, static_argnums=0)
+def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
+    """The polished fit as a function of the inputs."""
+    at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
+    here = at_rest.projection
+    surface = end.surface.moved_to(at_rest.net)
+    fixed = lax.stop_gradient(inputs)
+    method = eqx.combine(fixed.numbers, rest)
+    system = newton_system(method, end.state, surface, end.problem, (here.u, here.v), here.error)
+
+    def residual(net: Array) -> StationarityResidual:
+        method = eqx.combine(inputs.numbers, rest)
+        problem, still = _problem(end, inputs), _base_net(end, inputs)
+        u, v = (here.u, here.v) if method.finds_feet else _given_feet(end, inputs)
+        feet = feet_in_rows(surface, end.problem, u, v)
+        args = (method, end.state, end.surface.moved_to(net), problem, feet)
+        return stationarity_residual(*args, at_rest.free, still)
+
+    accuracy = float(jnp.finfo(at_rest.net.dtype).eps) ** ACCURACY
+    net = lax.custom_root(
+        lambda net: residual(net).value,
+        at_rest.net,
+        solve=lambda _, net: net,
+        tangent_solve=lambda apply, right: system.solved_differentiably(apply, right, accuracy),
+    )
+    return _outward(end, inputs, at_rest, net, residual(net))
+
+
+def _outward(
+    end: EndOfFit, inputs: FitInputs, at_rest: PolishedFit, net: Array, found: StationarityResidual
+) -> Fitted:
+    """In the user's unit and the order of the points."""
+    count, unit = inputs.points.shape[0], end.unit
+    rows = feet_in_rows(end.surface, end.problem, at_rest.projection.u, at_rest.projection.v).rows
+    number = end.order[jnp.minimum(rows.point, end.order.shape[0] - 1)]
+    number = jnp.where(rows.filled, number, count)
+
+    def by_point(x: Array) -> Array:
+        return jnp.zeros(count, x.dtype).at[number].set(x, mode="drop")
+
+    moved = net * unit.scale + unit.centre[None, None]
+    kept = _base_net(end, inputs) * unit.scale + unit.centre[None, None]
+    if inputs.control_points.shape == net.shape:
+        kept = inputs.control_points.astype(net.dtype)  # to the last bit
+    net = jnp.where(at_rest.free[:, :, None], moved, kept)
+    error = by_point(found.error) * unit.scale
+    diagonal = _problem(end, inputs).diagonal * unit.scale
+    return Fitted(net, by_point(found.u), by_point(found.v), error, diagonal, at_rest.stationarity)
+
+
+def _problem(end: EndOfFit, inputs: FitInputs) -> Problem:
+    """The problem as a function of the inputs. The diagonal follows the points; scale and centre need not."""
+    unit, problem = end.unit, end.problem
+    inner = (inputs.points - unit.centre[None]) / unit.scale
+    spare = end.order.shape[0] - inner.shape[0]
+    target = jnp.pad(inner.astype(problem.target.dtype).T, ((0, 0), (0, spare)), mode="edge")[:, end.order]
+    weight = problem.weight
+    if inputs.weights is not None:
+        weight = jnp.pad(inputs.weights.astype(weight.dtype), (0, spare))[end.order]
+    counted = (weight > 0)[None]
+    low, high = (
+        pick(jnp.where(counted, target, sign * jnp.inf), axis=1)
+        for pick, sign in ((jnp.min, 1.0), (jnp.max, -1.0))
+    )
+    diagonal = jnp.sqrt(jnp.sum((high - low) ** 2))
+    return eqx.tree_at(lambda p: (p.target, p.weight, p.diagonal), problem, (target, weight, diagonal))
+
+
+def _base_net(end: EndOfFit, inputs: FitInputs) -> Float[Array, "nu nv d"]:
+    """The base surface on the knots of the final one, in the unit of the problem."""
+    net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
+    net = net.astype(end.surface.control_points.dtype)
+    if net.shape == end.surface.control_points.shape:
+        return net
+    for old, new in zip(end.knots, (end.surface.knots_u, end.surface.knots_v), strict=True):
+        first, weights = insertion_weights(old, new, old.shape[0] - net.shape[0])
+        near = windows(net, first, weights.shape[0])
+        moved = jnp.einsum("ri...,ri->i...", near, weights, precision=lax.Precision.HIGHEST)
+        net = jnp.swapaxes(moved, 0, 1)
+    return net
+
+
+def _given_feet(end: EndOfFit, inputs: FitInputs) -> tuple[Array, Array]:
+    """The parameters that the fit was given, or those of the closest points on the base surface."""
+    feet = end.projection.u, end.projection.v
+    spare = end.order.shape[0] - inputs.points.shape[0]
+    if inputs.start is not None:
+        u, v = (jnp.pad(x, (0, spare), mode="edge")[end.order] for x in inputs.start)
+        return u.astype(feet[0].dtype), v.astype(feet[0].dtype)
+    problem = _problem(end, inputs)
+    tolerance = default_foot_tolerance(feet[0].dtype) * problem.diagonal
+    net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
+    return as_feet(feet, (net, *end.knots), problem.target.T, tolerance)

@@ -1,0 +1,82 @@
+"""Linear systems with the derivative of G: matrix-free GMRES, preconditioned by the Gauss-Newton matrix."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._normal_equations import (
+    CoupledPreconditioner,
+    Operator,
+    Stencil,
+    coupled_preconditioner,
+    free_points,
+    gmres,
+)
+
+RESTART, MOST_CYCLES = 40, 25  # of GMRES
+WORST = 1e-4  # the residual that a derivative may leave
+# The share of the rows at fixed parameters in the preconditioner: what curvature adds along the surface.
+DAMPING = 1e-3
+
+
+class NewtonSystem(eqx.Module):
+    """What is known about the derivative of G: a preconditioner, and the control points that G determines.
+
+    `fixed` is the normal matrix at fixed parameters. All are symmetric and serve the transposed system, too.
+    """
+
+    preconditioner: CoupledPreconditioner
+    fixed: Stencil
+    free: Bool[Array, "nu nv"]
+
+    def solved(
+        self, apply: Operator, right: Array, shift: Any, rtol: float, most_cycles: int
+    ) -> Float[Array, "nu nv d"]:
+        """x with (A + shift fixed) x = right, for A or its transpose."""
+        free = self.free[:, :, None]
+
+        def shifted(x: Array) -> Array:
+            return apply(x) + jnp.where(free, shift * self.fixed(jnp.where(free, x, 0.0)), 0.0)
+
+        return gmres(shifted, self.preconditioner, right, RESTART, rtol, most_cycles).net
+
+    def solved_differentiably(self, apply: Operator, right: Array, rtol: float) -> Float[Array, "nu nv d"]:
+        """x with A x = right, linear in `right` for forward and reverse mode; NaN where it was not found."""
+        system = jax.lax.stop_gradient(self)
+
+        def solve(apply: Operator, right: Array) -> Array:
+            found = gmres(apply, system.preconditioner, right, RESTART, rtol, MOST_CYCLES)
+            return jnp.where(found.left <= WORST, found.net, jnp.nan)
+
+        return jax.lax.custom_linear_solve(apply, right, solve=solve, transpose_solve=solve)
+
+
+def newton_system(
+    method: AbstractIterativeMethod,
+    state: Any,
+    surface: WorkingSurface,
+    problem: Problem,
+    feet: tuple[Array, Array],
+    error: Float[Array, " points"],
+    shift: Any = 0.0,
+) -> NewtonSystem:
+    """With the factors of the Gauss-Newton matrix, whose rows are blended with those at fixed parameters."""
+    condition = method.stationarity(problem, surface, state, error)
+    damping = jnp.minimum(DAMPING + shift, 1.0) if method.finds_feet else 1.0
+    damping = jnp.asarray(damping, error.dtype)
+    matrix = normal_equations(problem, surface.pieces, *feet, condition.weight, damping).matrix
+    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
+    fixed = Stencil(matrix.trace.entries / (1.0 + (problem.target.shape[0] - 1) * damping))
+    if condition.penalty is not None:
+        stiffness = condition.penalty.system(surface.control_points)[0]
+        matrix, fixed = matrix.plus(stiffness, 1.0), fixed.plus(stiffness, 1.0)
+    free = free_points(fixed, condition.held)
+    return NewtonSystem(coupled_preconditioner(matrix, fixed, free), fixed, free)

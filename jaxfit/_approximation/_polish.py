@@ -1,0 +1,149 @@
+"""Newton steps on G, from the surface that a fit ended with to the one it would come to rest at."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+from jaxfit._approximation._damping import within_reach
+from jaxfit._approximation._newton_system import newton_system
+from jaxfit._approximation._stationarity_residual import (
+    feet_in_rows,
+    stationarity_residual,
+)
+from jaxfit._cells import values_at
+from jaxfit._closest import Newton
+from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._feet import measure_feet
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._precision import default_foot_tolerance
+
+ACCURACY, MOST_CYCLES = 1e-3, 3  # of the linear systems of the steps
+REACH = 0.6  # of the distance between control points: the longest move in a step
+# The ratio of the actual to the predicted work: above GOOD the shift falls, below POOR it rises.
+GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.1, 4.0
+FIRST_SHIFT, TAKEN_BACK, LEAST_SHIFT, MOST_SHIFT = 1e-4, 10.0, 1e-8, 1e2
+GROWTH = 4.0  # of |G| in an accepted step
+
+
+class PolishedFit(eqx.Module):
+    """The surface at rest, its feet, and |G| over the norms of its terms.
+
+    `free` are the control points that G determines.
+    """
+
+    net: Float[Array, "nu nv d"]
+    projection: Projection
+    free: Bool[Array, "nu nv"]
+    stationarity: Float[Array, ""]
+
+
+class _Accepted(eqx.Module):
+    net: Float[Array, "nu nv d"]
+    projection: Projection
+    value: Float[Array, "nu nv d"]  # G
+    size: Float[Array, ""]  # its norm
+    terms: Float[Array, ""]
+    goal: Float[Array, ""]
+
+
+class _State(eqx.Module):
+    """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
+
+    accepted: _Accepted
+    trial: Float[Array, "nu nv d"]
+    predicted: Float[Array, ""]
+    shift: Float[Array, ""]
+    steps: Int[Array, ""]
+    again: Bool[Array, ""]
+    done: Bool[Array, ""]
+
+
+def polished(
+    method: AbstractIterativeMethod,
+    adjoint: ImplicitAdjoint,
+    problem: Problem,
+    surface: WorkingSurface,
+    state: Any,
+    projection: Projection,
+) -> PolishedFit:
+    r"""Newton steps until G is small enough or nothing helps any more.
+
+    A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
+    where $(G_0 + G_1) \cdot \delta P < 0$. To third order that is twice the change of the objective of which
+    G is the gradient, and it needs no such objective. mu is 0 unless steps are rejected.
+    """
+    problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
+    still = surface.control_points
+    feet = projection.u, projection.v
+    free = newton_system(method, state, surface, problem, feet, projection.error).free
+    goal = adjoint.goal(still.dtype)
+
+    def advance(now: _State) -> _State:
+        old, there = now.accepted, surface.moved_to(now.trial)
+        here = _measured(method, problem, there, old.projection)
+        feet = feet_in_rows(there, problem, here.u, here.v)
+
+        def residual(net: Array) -> tuple[Array, Any]:
+            moved = surface.moved_to(net)
+            found = stationarity_residual(method, state, moved, problem, feet, free, still)
+            return found.value, (found.terms, jnp.maximum(goal * found.terms, found.rounding))
+
+        value, apply, (terms, least) = jax.linearize(residual, now.trial, has_aux=True)
+        new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), terms, least)
+        work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
+        good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
+        shift = _next_shift(now, work, good)
+
+        def step() -> tuple[Array, Array]:
+            system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
+            move = _shortened(now.trial, system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES))
+            return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
+
+        done = good & ((new.size <= least) | (now.steps >= adjoint.polish_steps))
+        none = (old.net, jnp.zeros_like(work))
+        trial, predicted = lax.cond(good & ~done, step, lambda: none)
+        accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
+        return _State(accepted, trial, predicted, shift, now.steps + good, ~good, done | (shift > MOST_SHIFT))
+
+    nothing = jnp.zeros((), still.dtype)
+    first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
+    yes = jnp.asarray(True)
+    begin = _State(first, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes)
+    end = lax.while_loop(lambda now: ~now.done, advance, begin).accepted
+    share = end.size / jnp.where(end.terms > 0, end.terms, 1.0)
+    return PolishedFit(end.net, end.projection, free, share)
+
+
+def _next_shift(now: _State, work: Array, good: Array) -> Array:
+    """mu of the next step, from the work that this one was predicted to do."""
+    ratio = work / jnp.where(now.predicted < 0, now.predicted, -1.0)
+    factor = jnp.where(ratio > GOOD, LOWERED, jnp.where(ratio < POOR, RAISED, 1.0))
+    fallen = factor * now.shift
+    fallen = jnp.where(fallen < LEAST_SHIFT, 0.0, fallen)
+    taken_back = jnp.maximum(TAKEN_BACK * now.shift, FIRST_SHIFT)
+    return jnp.where(now.again, now.shift, jnp.where(good, fallen, taken_back))
+
+
+def _shortened(net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
+    """The move, shorter where a control point would come too near to its neighbours."""
+    length, limit = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (move, within_reach(net, move, REACH)))
+    return move * jnp.min(jnp.where(length > limit, limit / jnp.where(length > 0, length, 1.0), 1.0))
+
+
+def _measured(
+    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, before: Projection
+) -> Projection:
+    """Feet, converged as far as a derivative needs, or without feet the errors at the parameters."""
+    if method.finds_feet:
+        tolerance = default_foot_tolerance(problem.target.dtype)
+        return measure_feet(Newton(), problem, surface.pieces, before, tolerance)
+    residual = values_at(surface.pieces, before.u, before.v) - problem.target
+    distance = jnp.sqrt(jnp.sum(jnp.where(problem.real[None], residual, 0.0) ** 2, axis=0))
+    return eqx.tree_at(lambda p: p.error, before, distance)

@@ -1,0 +1,190 @@
+r"""G, the residual of a method's `Stationarity`, as a differentiable function of net and data.
+
+The feet are eliminated: they move with the net and with the points by the implicit derivative of a closest
+point. Points are laid out in rows of one cell at the feet of one net, and the function is exact there, with
+its first derivatives; a move of a foot is a number that is zero and has a derivative.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+from jaxfit._cells import Rows, cells_to_net, evaluate_jet, row_coefficients, row_moments, row_width, rows_of
+from jaxfit._cells import local_coordinates as local_coordinates_of
+from jaxfit._closest import dot
+from jaxfit._closest._implicit import foot_change
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._splines._pieces import Pieces
+
+ROUNDING = 64.0  # rounding units of the sums of G: what is left of them counts as zero
+
+
+class FeetInRows(eqx.Module):
+    """Where the points are in rows of one cell, and their feet there, in both coordinates."""
+
+    rows: Rows
+    u: Float[Array, "rows width"]
+    v: Float[Array, "rows width"]
+    s: Float[Array, "rows width"]
+    t: Float[Array, "rows width"]
+
+
+class StationarityResidual(eqx.Module):
+    """G at one net, per control point; what it is small or large against; and where the feet are.
+
+    `terms` is the sum of the norms of the terms of G, and `rounding` what G cannot fall below.
+    """
+
+    value: Float[Array, "nu nv d"]
+    terms: Float[Array, ""]
+    rounding: Float[Array, ""]
+    u: Float[Array, "rows width"]
+    v: Float[Array, "rows width"]
+    error: Float[Array, "rows width"]
+
+
+def feet_in_rows(surface: WorkingSurface, problem: Problem, u: Array, v: Array) -> FeetInRows:
+    """All real points, those of weight 0 too, for the derivative with respect to their weight."""
+    pieces = jax.tree.map(jnp.asarray, surface.pieces)
+    width = row_width(u.shape[0], pieces.cells)
+    rows = rows_of(pieces, u, v, width, ~jnp.asarray(problem.real))
+    u, v = rows.spread(jnp.stack([u, v]))
+    s, t = local_coordinates_of(pieces, rows.cell[:, None], u, v)
+    return FeetInRows(rows, u, v, s, t)
+
+
+def in_rows(problem: Problem, rows: Rows) -> Problem:
+    """The problem with a slot of the rows for each point; empty slots have weight 0."""
+    spread = rows.spread(jnp.concatenate([problem.target, problem.weight[None]]))
+    filled = rows.filled.reshape(-1)
+    flat = spread.reshape(spread.shape[0], -1)
+    parts = flat[:-1], jnp.where(filled, flat[-1], 0.0), filled
+    return eqx.tree_at(lambda p: (p.target, p.weight, p.real), problem, parts)
+
+
+def stationarity_residual(
+    method: AbstractIterativeMethod,
+    state: Any,
+    surface: WorkingSurface,
+    problem: Problem,
+    feet: FeetInRows,
+    free: Bool[Array, "nu nv"],
+    still: Float[Array, "nu nv d"],
+) -> StationarityResidual:
+    """G at the net of `surface`, whose feet are `feet`. Control points not `free` should be as in `still`.
+
+    Where the method finds feet, they follow the net and the points. Otherwise `feet` are given.
+    """
+    here, pieces = in_rows(problem, feet.rows), surface.pieces
+    pieces = jax.tree.map(jnp.asarray, pieces)
+    d, shape = problem.target.shape[0], feet.s.shape
+    target, (order_u, order_v) = here.target.reshape(d, *shape), pieces.order
+    s, t = jax.lax.stop_gradient((feet.s, feet.t))
+    jet = evaluate_jet(row_coefficients(pieces, feet.rows), s, t)
+    if method.finds_feet:
+        ds, dt = _foot_moves(pieces, feet, target, jet, problem)
+    else:
+        ds, dt = feet.s - s, feet.t - t
+    along_s, along_t = jax.lax.stop_gradient((jet.s, jet.t))
+    residual = jet.value - target + along_s * ds[None] + along_t * dt[None]
+    error = _length(residual)
+    condition = method.stationarity(here, surface, state, error.reshape(-1))
+    weight = condition.weight.reshape(shape)
+    pulls = weight[None] * residual
+    moments = row_moments(s, t, pulls, order_u, order_v)
+    fixed = jax.lax.stop_gradient(pulls)
+    moments += _raised_u(row_moments(s, t, fixed * ds[None], order_u - 1, order_v))
+    moments += _raised_v(row_moments(s, t, fixed * dt[None], order_u, order_v - 1), order_v - 1)
+    data = _on_net(pieces, feet.rows, moments)
+    smooth = _half_gradient(condition, surface.control_points)
+    inside = free[:, :, None]
+    value = jnp.where(inside, data + smooth, surface.control_points - still)
+    terms, rounding = _sizes(pieces, feet, jet.value, pulls, weight, smooth, inside)
+    wide = surface.axis_u, surface.axis_v
+    half_u, half_v = (jnp.asarray(a.half) for a in wide)
+    cell_u, cell_v = feet.rows.cell // wide[1].cells, feet.rows.cell % wide[1].cells
+    u = jax.lax.stop_gradient(feet.u) + half_u[cell_u][:, None] * ds
+    v = jax.lax.stop_gradient(feet.v) + half_v[cell_v][:, None] * dt
+    return StationarityResidual(value, terms, rounding, u, v, error)
+
+
+def _half_gradient(condition: Stationarity, net: Array) -> Array:
+    penalty = condition.penalty
+    return jnp.zeros_like(net) if penalty is None else 0.5 * jax.grad(penalty.energy)(net)
+
+
+def _on_net(pieces: Pieces, rows: Rows, moments: Array) -> Array:
+    total = jnp.zeros((pieces.cells, *moments.shape[1:]), moments.dtype).at[rows.cell].add(moments)
+    return cells_to_net(total, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
+
+
+def _sizes(
+    pieces: Pieces, feet: FeetInRows, value: Array, pulls: Array, weight: Array, smooth: Array, inside: Array
+) -> tuple[Array, Array]:
+    """The norms of sum_k w_k N_i N_j |r_k| plus that of the smoothing term, and what rounding leaves."""
+    values = jnp.stack([_length(pulls), jnp.abs(weight) * _length(value)])
+    values, s, t, smooth = jax.lax.stop_gradient((values, feet.s, feet.t, smooth))
+    sums = _on_net(pieces, feet.rows, row_moments(s, t, values, *pieces.order))
+    sums = jnp.where(inside, sums, 0.0)
+    data, places = jnp.sqrt(jnp.sum(sums**2, axis=(0, 1)))
+    terms = data + jnp.sqrt(jnp.sum(jnp.where(inside, smooth, 0.0) ** 2))
+    return terms, ROUNDING * jnp.finfo(value.dtype).eps * places
+
+
+def _foot_moves(
+    pieces: Pieces, feet: FeetInRows, target: Array, jet: Any, problem: Problem
+) -> tuple[Array, Array]:
+    """Zero, with the derivative of the feet in local coordinates."""
+    e = target - jet.value
+    slopes = dot(e, jet.s), dot(e, jet.t)
+    form = dot(jet.s, jet.s), dot(jet.s, jet.t), dot(jet.t, jet.t)
+    second = dot(e, jet.ss), dot(e, jet.st), dot(e, jet.tt)
+    hessian = tuple(x - y for x, y in zip(form, second, strict=True))
+    ends = tuple(x for a in (pieces.axis_u, pieces.axis_v) for x in (a.breaks[0], a.breaks[-1]))
+    tolerance = FOOT_TOLERANCE * jnp.sqrt(jnp.finfo(e.dtype).eps) * problem.diagonal
+    fixed = jax.lax.stop_gradient(((feet.u, feet.v), form, hessian, ends, tolerance))
+    return _moved(slopes, fixed)
+
+
+FOOT_TOLERANCE = 1e-2  # roots of the rounding unit, over 100: tangential residuals beyond this are a crease's
+
+
+@jax.custom_jvp
+def _moved(slopes: tuple[Array, Array], fixed: Any) -> tuple[Array, Array]:
+    return jnp.zeros_like(slopes[0]), jnp.zeros_like(slopes[1])
+
+
+@_moved.defjvp
+def _moved_jvp(primals: Any, tangents: Any) -> Any:
+    slopes, (feet, form, hessian, ends, tolerance) = primals
+    changes = foot_change(feet, slopes, form, hessian, tangents[0], ends, tolerance)
+    return _moved(*primals), changes
+
+
+def _length(x: Float[Array, "d rows width"]) -> Float[Array, "rows width"]:
+    """Lengths, with the derivative 0 where they vanish."""
+    square = dot(x, x)
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def _raised_u(moments: Float[Array, "rows k m"]) -> Float[Array, "rows K m"]:
+    """From sums over s^a t^b x those over the derivatives of the powers of s."""
+    power = jnp.arange(1, moments.shape[1] + 1, dtype=moments.dtype)
+    return jnp.pad(power[None, :, None] * moments, ((0, 0), (1, 0), (0, 0)))
+
+
+def _raised_v(moments: Float[Array, "rows K m"], lower: int) -> Float[Array, "rows K M"]:
+    """Likewise for the powers of t, of which there are `lower`."""
+    rows, order_u, _ = moments.shape
+    x = moments.reshape(rows, order_u, lower, -1)
+    power = jnp.arange(1, lower + 1, dtype=moments.dtype)
+    raised = jnp.pad(power[None, None, :, None] * x, ((0, 0), (0, 0), (1, 0), (0, 0)))
+    return raised.reshape(rows, order_u, -1)

@@ -1,0 +1,112 @@
+"""`ImplicitAdjoint` and `UnrolledAdjoint`: what the derivative of a fit is."""
+
+from abc import abstractmethod
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jaxfit._checks import check_number
+
+# Moves after which feet that are never held count as converged.
+CONVERGED_AFTER = 200
+
+
+class AbstractAdjoint(eqx.Module):
+    """What the derivative of a fit is."""
+
+    @abstractmethod
+    def moves(self, freeze_after: int | None) -> int | None:
+        """Of an interpolation: through how many moves of the net feet are followed; None for feet that do
+        not move at all.
+        """
+
+
+class UnrolledAdjoint(AbstractAdjoint):
+    r"""The derivative of the fit as run, which finite differences agree with.
+
+    Of an interpolation: feet are followed through the iterations before they are held, each by the implicit
+    derivative of its closest point. The net then solves $N(\hat u, \hat v) P = Q$, and so does its derivative
+
+    $$N \, dP = dQ - dN \, P,$$
+
+    with one sparse solve, whatever the number of iterations was.
+
+    Parameters
+    ----------
+    moves_followed : int, optional
+        Through how many moves; default as many as move feet, `freeze_after`, or 200 where feet are never
+        held. Reverse mode runs each a second time and keeps one net for each. Interpolation only.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> jf.GeometricInterpolation(adjoint=jf.UnrolledAdjoint()).adjoint
+    UnrolledAdjoint()
+    """
+
+    moves_followed: int | None = None
+
+    def moves(self, freeze_after: int | None) -> int:
+        """As told, or as many as move feet."""
+        if self.moves_followed is not None:
+            return self.moves_followed
+        return CONVERGED_AFTER if freeze_after is None else freeze_after
+
+
+class ImplicitAdjoint(AbstractAdjoint):
+    r"""The derivative of the surface that a fit comes to rest at, by the implicit function theorem.
+
+    Of an approximation: where G(P) = 0 is the condition of `Stationarity`, with the feet eliminated,
+
+    $$dP = -\Big(\frac{\partial G}{\partial P}\Big)^{-1} dG,$$
+
+    by one linear solve, whatever the number of iterations was. A fit stops where its errors no longer fall,
+    which is before G vanishes, and the derivative there would be wrong by percents. So the surface is first
+    polished: Newton steps on G. The fit that is differentiated, and any fit that `adjoint=ImplicitAdjoint()`
+    is passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms
+    of the terms of G. Read it: above about 1e-6 the surface could not be polished, and the derivative is not
+    to be trusted.
+
+    Of an interpolation: the derivative at held parameters and knots, $dP = N(\hat u, \hat v)^{-1} dQ$. Any
+    parameters at which the surface meets the data solve the interpolation problem, so this is the derivative
+    of a solution, though not of the one that the fit returns for other data. It is linear in the data and
+    cheaper than `UnrolledAdjoint`.
+
+    Parameters
+    ----------
+    residual : float
+        Polishing ends at this relative residual of G, or at rounding (default 1e-12; in single precision
+        times the ratio of the rounding units).
+    polish_steps : int
+        The largest number of Newton steps (default 30). Where they are rejected they are damped. 0 leaves the
+        surface as it is. Approximation only.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+
+    Examples
+    --------
+    >>> import jaxfit as jf
+    >>> adjoint = jf.ImplicitAdjoint()
+    >>> adjoint.residual, adjoint.polish_steps
+    (1e-12, 30)
+    """
+
+    residual: float = 1e-12
+    polish_steps: int = 30
+
+    def __check_init__(self) -> None:
+        check_number("residual", self.residual, 0.0)
+        check_number("polish_steps", self.polish_steps, 0, whole=True)
+
+    def moves(self, freeze_after: int | None) -> None:
+        """None."""
+        return
+
+    def goal(self, dtype: Any) -> float:
+        """The residual to reach in this precision."""
+        eps = float(jnp.finfo(dtype).eps)
+        return float(self.residual) * eps / float(jnp.finfo(jnp.float64).eps)

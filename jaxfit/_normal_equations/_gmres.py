@@ -1,0 +1,93 @@
+"""Restarted GMRES (Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986), preconditioned from the left."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+Operator = Callable[[Array], Array]
+
+SLOW = 0.9  # a cycle that leaves more of the residual than this is the last
+
+
+class GmresSolution(NamedTuple):
+    """An approximate solution, the share of the residual that is `left`, and the cycles it took."""
+
+    net: Float[Array, "n m d"]
+    left: Float[Array, ""]
+    cycles: Int[Array, ""]
+
+
+def gmres(
+    apply: Operator,
+    precondition: Operator,
+    right: Float[Array, "n m d"],
+    restart: int,
+    rtol: float,
+    most_cycles: int,
+) -> GmresSolution:
+    """Solves a regular system, symmetric or not, from 0.
+
+    Stops where the preconditioned residual is `rtol` times the preconditioned right-hand side, or where a
+    cycle takes less than a tenth of it away. A cycle that makes it greater is not accepted.
+    """
+
+    def size(x: Array) -> Array:
+        return jnp.sqrt(jnp.sum(precondition(x) ** 2))
+
+    State = tuple[Array, Array, Array, Array, Array]
+
+    def unfinished(state: State) -> Array:
+        _, _, left, cycles, slow = state
+        return ~slow & (left > goal) & (cycles < most_cycles)
+
+    def cycle(state: State) -> State:
+        x, residual, before, cycles, _ = state
+        moved = x + gmres_cycle(apply, precondition, residual, restart)
+        rest = right - apply(moved)
+        after = size(rest)
+        better = after < before
+        x, residual = (jnp.where(better, new, old) for new, old in ((moved, x), (rest, residual)))
+        return x, residual, jnp.where(better, after, before), cycles + 1, ~(after < SLOW * before)
+
+    first = size(right)
+    goal = rtol * first
+    begin = (jnp.zeros_like(right), right, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
+    x, _, left, cycles, _ = lax.while_loop(unfinished, cycle, begin)
+    return GmresSolution(x, left / jnp.where(first > 0, first, 1.0), cycles)
+
+
+def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: int) -> Array:
+    """One cycle from zero: the x of the Krylov space for which M (right - A x) is smallest.
+
+    Twice classical Gram-Schmidt. An exhausted space adds zero vectors, which the least-squares problem leaves
+    alone.
+    """
+    first = precondition(right).reshape(-1)
+    size = jnp.linalg.norm(first)
+    info = jnp.finfo(right.dtype)
+    basis = (
+        jnp.zeros((restart + 1, first.shape[0]), right.dtype).at[0].set(first / jnp.maximum(size, info.tiny))
+    )
+    projected = jnp.zeros((restart + 1, restart), right.dtype)
+
+    def extend(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        basis, projected = state
+        new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
+        scale = jnp.linalg.norm(new)
+        once = basis @ new
+        new = new - once @ basis
+        twice = basis @ new
+        new = new - twice @ basis
+        length = jnp.linalg.norm(new)
+        fresh = length > 10 * info.eps * scale
+        length = jnp.where(fresh, length, 0.0)
+        basis = basis.at[k + 1].set(jnp.where(fresh, new / jnp.where(fresh, length, 1.0), 0.0))
+        return basis, projected.at[:, k].set((once + twice).at[k + 1].set(length))
+
+    basis, projected = lax.fori_loop(0, restart, extend, (basis, projected))
+    goal = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
+    weights = jnp.linalg.lstsq(projected, goal)[0]
+    return (weights @ basis[:-1]).reshape(right.shape)
