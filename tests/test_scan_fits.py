@@ -121,7 +121,7 @@ def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
         ({"start": (np.zeros(9), np.zeros(9))}, ValueError, "start must be None where no boundary"),
         ({"hole_length": -1.0}, ValueError, "hole_length must be a number of at least 0"),
         ({"faces": np.array([[0, 1]])}, ValueError, "faces must hold three whole numbers"),
-        ({"faces": [[0, 1, 10**6]]}, ValueError, "faces must hold numbers of points from 0"),
+        ({"faces": np.array([[0, 1, 10**6]])}, ValueError, "faces must hold numbers of points from 0"),
         ({"net": (3, 3)}, ValueError, "net must be at least 4 x 4"),
         ({"points": np.zeros((40, 2))}, ValueError, "points must have 3 coordinates"),
         ({"points": np.full((40, 3), np.nan)}, ValueError, "points must hold at least 12 distinct"),
