@@ -19,9 +19,9 @@ INPUT   .npz  'grid' (n, m, 3), or 'points' (N, 3) with 'boundary_v0', 'boundary
         .csv .xyz .txt  scattered points, one x y z a line
         .ply .stl .obj .off .las .laz .e57 .pcd  scattered points or the vertices of a mesh
         jacksboro       the terrain inside Matplotlib
-OUTPUT  .npz  control_points, knots_u, knots_v, order
+OUTPUT  .npz  control_points, knots_u, knots_v, order; loops of a trimmed surface
         .json geomdl's exchange format
-        .step .stp .iges .igs .3dm  for CAD
+        .step .stp .iges .igs .3dm  for CAD, trimmed where the rim was found
         .ply .stl .obj  triangles
 """
 _EPILOG = """\
@@ -115,7 +115,11 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
     )
-    parser.add_argument("--boundary", metavar="FILE", help=".npz with the four border polylines")
+    parser.add_argument(
+        "--boundary",
+        metavar="FILE",
+        help=".npz with the four border polylines of points; without, their rim is found",
+    )
     for which in ("average", "maximum"):
         parser.add_argument(
             f"--tol-{which}",

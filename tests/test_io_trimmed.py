@@ -97,6 +97,14 @@ def test_loops_that_would_coincide_in_space_are_refused(tmp_path, pole):
         assert area_of(shape_in(tmp_path / "s.step")) == pytest.approx(float(half.area()), rel=1e-4)
 
 
+def test_a_loop_below_the_tolerance_of_the_kernel_is_refused(tmp_path):
+    need("OCP")
+    trimmed = jf.TrimmedSurface(wavy_surface(), (SQUARE * 0.8 + 0.1, circle(0.5, 0.5, 1e-8)))
+    with pytest.raises(ValueError, match=r"loops must be larger than 1e-07 .*\.$"):
+        write_surface(tmp_path / "s.step", trimmed)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("suffix", [".stp", ".igs"])
 def test_large_coordinates_are_centred(tmp_path, suffix):
     need("OCP")

@@ -15,7 +15,6 @@ from jaxfit._trimmed._checked_loops import Loop, edges_of
 from jaxfit._trimmed._inside import inside_on_grid, inside_on_host
 
 _MOST_ROUNDS = 60
-_BLOCK = 4_000_000  # comparisons of points with segments at once
 
 Places = Float[np.ndarray, "_ 2"]
 Segments = Int[np.ndarray, "_ 2"]
@@ -122,9 +121,11 @@ def _delaunay(places: Places) -> Triangles:
 
 
 def _sides(triangles: Triangles) -> Segments:
-    """Each side once."""
+    """Each side once, its lower vertex first."""
     pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    return np.unique(pairs, axis=0)
+    count = int(pairs.max()) + 1
+    # As single numbers, which sort ten times as fast as rows.
+    return np.stack(np.divmod(np.unique(pairs @ np.array([count, 1])), count), axis=1)
 
 
 def _among(pairs: Segments, others: Segments, count: int) -> Bool[np.ndarray, " _"]:
