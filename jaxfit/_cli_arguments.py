@@ -120,6 +120,12 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=".npz with the four border polylines of points; without, their rim is found",
     )
+    parser.add_argument(
+        "--hole-length",
+        type=_length,
+        metavar="L",
+        help="without a boundary, in the unit of the points: wider gaps are holes (default: from spacing)",
+    )
     for which in ("average", "maximum"):
         parser.add_argument(
             f"--tol-{which}",
@@ -151,6 +157,16 @@ def _percent(text: str) -> float:
         value = math.nan
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no percentage such as 0.02")
+    return value
+
+
+def _length(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is no length such as 2.5")
     return value
 
 

@@ -20,7 +20,7 @@ from jaxfit._cli_table import FAILED, FITTED, MISSED, Row
 from jaxfit._precision import bucket
 
 _FIT_OPTIONS = (
-    *"net order method grid boundary tol_average tol_maximum max_steps float32".split(),
+    *"net order method grid boundary tol_average tol_maximum max_steps hole_length float32".split(),
     *METHOD_OPTIONS,
 )
 _FILES = ("boundary", "normals")

@@ -54,6 +54,10 @@ class FitOfFile:
         self.method = _choose_method(args, data)
         self.options = fit_options(args, self.method)
         self.boundary = None if interpolates(self.method) else _choose_boundary(args, data)
+        if args.hole_length is not None and (self.boundary is not None or interpolates(self.method)):
+            raise io.InputError(
+                f"--hole-length is for points without a boundary, but {args.input} has one; leave it out."
+            )
 
     def run(self, progress: Any = None) -> FittedFile:
         """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""
@@ -81,6 +85,8 @@ class FitOfFile:
                 # Interpolation bounds the maximum error, and with it the average.
                 options["tolerance"] = min(tolerances.values())
             return jaxfit.interpolate(data.grid, **options)
+        if self.boundary is None:
+            options |= {"faces": data.faces, "hole_length": args.hole_length}
         return jaxfit.fit_points(data.cloud, self.boundary, net=args.net, **tolerances, **options)
 
 

@@ -130,10 +130,17 @@ def test_options_arrive_as_fractions(fits, folder):
 
 
 def test_points_without_boundary_are_fitted_without(fits, folder):
-    assert run("bare.xyz") == 0
+    assert run("bare.xyz", "--hole-length", "0.25") == 0
     _, points, arguments, options = fits.made[0]
     assert (points.shape, arguments) == ((60, 3), (None,))
-    assert set(options) == {"order", "progress", "net"}
+    assert set(options) == {"order", "progress", "net", "faces", "hole_length"}
+    assert (options["faces"], options["hole_length"]) == (None, 0.25)
+
+
+def test_a_hole_length_is_for_points_without_boundary(fits, folder, capsys):
+    assert run("cloud.npz", "--hole-length", "0.25") == 2
+    assert "--hole-length is for points without a boundary" in capsys.readouterr().err
+    assert run("bare.xyz", "--hole-length", "0") == 2
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,7 @@ def test_corners_that_triangles_repeat_are_read_once(tmp_path):
         read = read_points(path)
         np.testing.assert_array_equal(read.points, points[:5])  # in the order of their first use
         assert read.left_out == {"repeated": 4}
+        assert read.faces.max() < len(read.points)
 
 
 def test_an_obj_of_several_materials_is_one_cloud(tmp_path):

@@ -150,3 +150,19 @@ def test_a_missing_library_is_one_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "shapely", None)
     with pytest.raises(ImportError, match=r'pip install "jaxfit-surfaces\[scan\]"'):
         jf.fit_points(scan())
+
+
+def test_what_a_file_holds_is_fitted_as_it_is(tmp_path):
+    pytest.importorskip("trimesh")
+    path = tmp_path / "bent.off"
+    points = np.array([[x, y, 0.1 * x * y] for x in range(6) for y in range(5)], float)
+    corners = np.array([i + 5 * j for j in range(5) for i in range(4)])
+    faces = np.concatenate([corners[:, None] + [0, 5, 6], corners[:, None] + [0, 6, 1]])
+    rows = [" ".join(map(str, x)) for x in points.tolist()] + [f"3 {a} {b} {c}" for a, b, c in faces.tolist()]
+    path.write_text("\n".join([f"OFF\n{len(points)} {len(faces)} 0", *rows]) + "\n")
+    read = jf.io.read_points(path)
+    np.testing.assert_array_equal(read.faces, faces)
+    fit = jf.fit_points(read, net=(6, 5), max_steps=2)
+    assert fit.stats["points_read"] == 30
+    given = jf.fit_points(points, faces=faces, net=(6, 5), max_steps=2)
+    np.testing.assert_array_equal(fit.surface.control_points, given.surface.control_points)

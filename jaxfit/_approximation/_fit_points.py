@@ -30,7 +30,7 @@ from jaxfit._fit._result import Fit
 
 @eager_where_concrete
 def fit_points(
-    points: ArrayLike,
+    points: Any,
     boundary: Boundary | None = None,
     net: tuple[int, int] | None = None,
     order: tuple[int, int] = (4, 4),
@@ -49,7 +49,8 @@ def fit_points(
     Parameters
     ----------
     points : array (points, d); (points, 3) without a boundary
-        In any order and any unit. Without a boundary they may hold duplicates, outliers and NaN.
+        In any order and any unit. Without a boundary they may hold duplicates, outliers and NaN. Or what
+        `jaxfit.io.read_points` has read, whose boundary and faces are taken where none are given.
     boundary : Boundary, optional
         The four sides of the patch.
     net : (nu, nv), optional
@@ -129,6 +130,8 @@ def fit_points(
     """
     _check_names(options)
     check_order(order)
+    if hasattr(points, "cloud"):
+        points, boundary, faces = _parts(points, boundary, faces)
     if boundary is None:
         return _without_boundary(points, faces, hole_length, net, order, method, base, options)
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
@@ -146,6 +149,12 @@ def fit_points(
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
     return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
+
+
+def _parts(data: Any, boundary: Any, faces: Any) -> tuple[Any, Any, Any]:
+    """Points, boundary and faces of a file, these two where there are no others."""
+    boundary = data.boundary if boundary is None else boundary
+    return data.cloud, boundary, data.faces if faces is None and boundary is None else faces
 
 
 def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int, int], base: Any) -> Any:

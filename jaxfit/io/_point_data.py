@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfit._base import Boundary
 
@@ -34,6 +34,8 @@ class PointData:
         Of a scanner's file or a mesh: how many of its points are not in `points`, by reason; empty if
         all are. The reasons are "withheld" and "classified as noise" (LAS), "invalid" (E57),
         "not finite", and of meshes "in no face" and "repeated".
+    faces
+        Of a mesh: the numbers of the `points` at the corners of each triangle; None otherwise.
     """
 
     points: Float[np.ndarray, "points 3"] | None
@@ -41,6 +43,7 @@ class PointData:
     boundary: Boundary | None
     name: str
     left_out: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    faces: Int[np.ndarray, "faces 3"] | None = None
 
     @property
     def cloud(self) -> Float[np.ndarray, "points 3"]:

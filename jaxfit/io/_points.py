@@ -80,8 +80,8 @@ def read_points(path: str | os.PathLike) -> PointData:
     if suffix in (".csv", ".xyz", ".txt"):
         return _from_array(read_columns(path), "points", path)
     if suffix in SCANS:
-        points, left_out = read_scan(path)
-        return dataclasses.replace(_from_array(points, "points", path), left_out=left_out)
+        points, left_out, faces = read_scan(path)
+        return dataclasses.replace(_from_array(points, "points", path), left_out=left_out, faces=faces)
     arrays, names = load_arrays(path, _KEYS)
     if suffix == ".npy" and "array" in arrays:
         array = arrays["array"]

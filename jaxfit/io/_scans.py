@@ -9,19 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfit.io._extras import import_extra
 from jaxfit.io._point_data import InputError
 
 Counts = dict[str, int]
 Points = Float[np.ndarray, "points 3"]
+Faces = Int[np.ndarray, "faces 3"]
+Found = tuple[Points, Counts, Faces | None]
 
 _NOISE = (7, 18)  # LAS classes: low and high noise
 
 
-def read_scan(path: Path) -> tuple[Points, Counts]:
-    """The points of a file, float64, in file order, and how many were left out for which reason.
+def read_scan(path: Path) -> tuple[Points, Counts, Faces | None]:
+    """The points of a file, float64, in file order, how many were left out for which reason, and faces.
 
     Raises
     ------
@@ -34,7 +36,7 @@ def read_scan(path: Path) -> tuple[Points, Counts]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            points, left_out = read(path, libraries[0])
+            points, left_out, faces = read(path, libraries[0])
     except InputError:
         raise
     except OSError as error:
@@ -45,14 +47,14 @@ def read_scan(path: Path) -> tuple[Points, Counts]:
         raise InputError(
             f"{path} is no {suffix} file that can be read ({_one_line(error)}); write it again."
         ) from error
-    return points, {reason: count for reason, count in left_out.items() if count}
+    return points, {reason: count for reason, count in left_out.items() if count}, faces
 
 
 def _finite(points: Points) -> Bool[np.ndarray, " points"]:
     return np.isfinite(points).all(axis=1)
 
 
-def _las(path: Path, laspy: Any) -> tuple[Points, Counts]:
+def _las(path: Path, laspy: Any) -> Found:
     las = laspy.read(path)
     points = _columns(las.x, las.y, las.z)  # scaled and shifted in float64
     _check_count(path, len(points), las.header.point_count)
@@ -60,14 +62,18 @@ def _las(path: Path, laspy: Any) -> tuple[Points, Counts]:
     noise = np.isin(np.asarray(las.classification), _NOISE) & ~withheld
     kept = ~withheld & ~noise
     finite = _finite(points)
-    return points[kept & finite], {
-        "withheld": int(withheld.sum()),
-        "classified as noise": int(noise.sum()),
-        "not finite": int((kept & ~finite).sum()),
-    }
+    return (
+        points[kept & finite],
+        {
+            "withheld": int(withheld.sum()),
+            "classified as noise": int(noise.sum()),
+            "not finite": int((kept & ~finite).sum()),
+        },
+        None,
+    )
 
 
-def _e57(path: Path, pye57: Any) -> tuple[Points, Counts]:
+def _e57(path: Path, pye57: Any) -> Found:
     """All scans of a file, each in the frame of the file."""
     with pye57.E57(str(path)) as file:
         claimed, scans = 0, []
@@ -77,10 +83,10 @@ def _e57(path: Path, pye57: Any) -> tuple[Points, Counts]:
             scans.append(_columns(*(scan[f"cartesian{axis}"] for axis in "XYZ")))
     points = np.concatenate([np.empty((0, 3)), *scans])
     finite = _finite(points)
-    return points[finite], {"invalid": claimed - len(points), "not finite": int((~finite).sum())}
+    return points[finite], {"invalid": claimed - len(points), "not finite": int((~finite).sum())}, None
 
 
-def _pcd(path: Path, pypcd4: Any) -> tuple[Points, Counts]:
+def _pcd(path: Path, pypcd4: Any) -> Found:
     cloud = pypcd4.PointCloud.from_path(path)
     missing = [axis for axis in "xyz" if axis not in cloud.fields]
     if missing:
@@ -88,39 +94,44 @@ def _pcd(path: Path, pypcd4: Any) -> tuple[Points, Counts]:
     points = _columns(*(np.atleast_1d(cloud.pc_data[axis]) for axis in "xyz"))
     _check_count(path, len(points), cloud.metadata.points)
     finite = _finite(points)
-    return points[finite], {"not finite": int((~finite).sum())}
+    return points[finite], {"not finite": int((~finite).sum())}, None
 
 
-def _mesh(path: Path, trimesh: Any) -> tuple[Points, Counts]:
-    """The vertices of a mesh, each once; all points of a file without faces."""
+def _mesh(path: Path, trimesh: Any) -> Found:
+    """The vertices of a mesh, each once, and its faces; all points of a file without faces."""
     options = {"process": False, "maintain_order": True, "skip_materials": True}
     scene = trimesh.load_scene(str(path), **options)
-    pieces, used, has_faces = [np.empty((0, 3))], [np.empty(0, bool)], False
+    pieces, corners, used = [np.empty((0, 3))], [np.empty((0, 3), int)], [np.empty(0, bool)]
     for geometry in scene.geometry.values():
         vertices = np.asarray(geometry.vertices, np.float64)
-        faces = np.asarray(getattr(geometry, "faces", ()), int)
+        faces = np.asarray(getattr(geometry, "faces", ()), int).reshape(-1, 3)
         referenced = np.full(len(vertices), not len(faces))
         referenced[faces.reshape(-1)] = True
+        corners.append(faces + sum(map(len, pieces)))
         pieces.append(vertices)
         used.append(referenced)
-        has_faces |= len(faces) > 0
-    points, in_face = np.concatenate(pieces), np.concatenate(used)
+    points, faces, in_face = (np.concatenate(x) for x in (pieces, corners, used))
     finite = _finite(points)
-    kept = points[in_face & finite]
     left_out = {"in no face": int((~in_face).sum()), "not finite": int((in_face & ~finite).sum())}
-    if has_faces:
-        first = _first_of_equals(kept)
-        left_out["repeated"] = int((~first).sum())
-        kept = kept[first]
-    return kept, left_out
+    kept = in_face & finite
+    if not len(faces):
+        return points[kept], left_out, None
+    same = _first_of_equals(np.where(kept[:, None], points, np.nan))  # NaN equals nothing
+    single = kept & (same == np.arange(len(points)))
+    left_out["repeated"] = int(kept.sum() - single.sum())
+    number = np.where(single, np.cumsum(single) - 1, -1)[same[faces]]
+    whole = (number >= 0).all(axis=1) & (np.diff(np.sort(number, axis=1), axis=1) > 0).all(axis=1)
+    return points[single], left_out, number[whole]
 
 
-def _first_of_equals(points: Points) -> Bool[np.ndarray, " points"]:
-    """Which points equal none before them, to the last bit."""
+def _first_of_equals(points: Points) -> Int[np.ndarray, " points"]:
+    """The number of the first point that equals each, to the last bit."""
     order = np.lexsort(points.T)  # stable: among equals the first comes first
     ordered = points[order]
-    first = np.ones(len(points), bool)
-    first[order[1:]] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    new = np.ones(len(points), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    first = np.empty(len(points), int)
+    first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
     return first
 
 
@@ -137,7 +148,7 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 
-_Reader = Callable[[Path, Any], tuple[Points, Counts]]
+_Reader = Callable[[Path, Any], Found]
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     **dict.fromkeys((".ply", ".stl", ".obj", ".off"), (("trimesh",), _mesh)),
     **dict.fromkeys((".las", ".laz"), (("laspy", "lazrs"), _las)),
