@@ -60,7 +60,8 @@ class SheetNets(AbstractNets):
     def net(self, size: float, most: int) -> tuple[int, int]:
         """Shared between the directions by the sides of the sheet laid out flat."""
         ratio = float(np.sqrt(self.sheet.sides[0] / self.sheet.sides[1]))
-        return net_of_ratio(size, ratio, self.order, min(most, MOST_SIZE))
+        most = min(most, MOST_SIZE)
+        return net_of_ratio(min(size, most / max(ratio, 1 / ratio)), ratio, self.order, most)
 
     def base(self, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface."""
