@@ -27,7 +27,7 @@ def carried_places(
 
     away, near = cKDTree(nodes).query(points, min(CANDIDATES, len(nodes)))
     steps = points[:, None] - nodes[near]
-    above = np.abs(np.sum(steps * _normals(nodes, faces)[near], axis=2))
+    above = np.abs(np.sum(steps * node_normals(nodes, faces)[near], axis=2))
     best = np.argmin(away + ACROSS * above, axis=1)[:, None]
     away, nearest = (np.take_along_axis(x, best, axis=1)[:, 0] for x in (away, near))
     step = np.einsum("pij,pj->pi", _gradients(nodes, faces, flat)[nearest], points - nodes[nearest])
@@ -37,7 +37,7 @@ def carried_places(
     return flat[nearest] + np.where(away[:, None] > 0, step, 0.0), away
 
 
-def _normals(nodes: np.ndarray, faces: Faces) -> Float[np.ndarray, "_ 3"]:
+def node_normals(nodes: np.ndarray, faces: Faces) -> Float[np.ndarray, "_ 3"]:
     """Unit normals of the nodes, the means over their triangles."""
     a, b, c = (nodes[faces[:, k]] for k in range(3))
     total = np.zeros_like(nodes)
