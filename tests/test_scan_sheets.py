@@ -49,7 +49,8 @@ def test_a_square_sheet_has_one_loop_and_fills_its_rectangle():
     assert len(sheet.loops) == 1
     assert sheet.on_sheet.all()
     layout = sheet.layout((10, 10), (4, 4))
-    assert np.allclose(np.ptp(layout.parameters, axis=0), 1 - 2 / 10, atol=0.05)
+    assert np.allclose(np.ptp(layout.parameters, axis=0), 1 - 1 / 7, atol=0.07)
+    assert [len(x) for x in layout.knots] == [14, 14]
     assert layout.parameters.min() > 0
     assert layout.parameters.max() < 1
 

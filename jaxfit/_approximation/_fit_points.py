@@ -43,8 +43,8 @@ def fit_points(
     """Fit a surface to a cloud of points: with four boundary polylines, or a raw scan.
 
     With a boundary: `base_surface`, then `approximate`. Without one the points are cleaned and connected by a
-    mesh, whose rim and holes become loops in (u, v). The surface is larger than the sheet by a knot span on
-    each side, smooth where there are no points.
+    mesh, whose rim and holes become loops in (u, v). The surface is larger than the sheet, by half a span
+    of its knots on each side, and smooth where there are no points.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class BoundaryNets(AbstractNets):
 
 @dataclasses.dataclass
 class SheetNets(AbstractNets):
-    """Surfaces beyond the sheet on all sides, on uniform knots, each at parameters made for it."""
+    """Surfaces beyond the sheet on all sides, each at parameters made for it."""
 
     sheet: Sheet
     order: tuple[int, int]
@@ -60,13 +60,15 @@ class SheetNets(AbstractNets):
     def net(self, size: float, most: int) -> tuple[int, int]:
         """Shared between the directions by the sides of the sheet laid out flat."""
         ratio = float(np.sqrt(self.sheet.sides[0] / self.sheet.sides[1]))
-        return net_of_ratio(size, ratio, self.order, min(most, MOST_SIZE))
+        most = min(most, MOST_SIZE)
+        return net_of_ratio(min(size, most / max(ratio, 1 / ratio)), ratio, self.order, most)
 
     def base(self, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface."""
         some = self.sheet.on_sheet
         points = self.sheet.points[some] * self.sheet.size + self.sheet.centre
-        return free_base(points, self.sheet.layout(net, self.order).parameters[some], net, self.order)
+        layout = self.sheet.layout(net, self.order)
+        return free_base(points, layout.parameters[some], layout.knots, self.order)
 
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface as well: what a coarse net made of the parameters is forgotten."""

@@ -7,6 +7,8 @@ from jaxtyping import Float
 
 from jaxfit._scan._manifold import Faces
 
+CANDIDATES = 8  # nodes next to a point
+ACROSS = 4.0  # by how much a step across the sheet counts more
 REACH = 2.0  # longest step from a node, as a multiple of the usual edge
 
 
@@ -16,15 +18,32 @@ def carried_places(
     faces: Faces,
     flat: Float[Any, "nodes 2"],
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
-    """Places in the plane of all points, and their distances from the nearest nodes."""
+    """Places in the plane of all points, and their distances from the nearest nodes.
+
+    A step out of the tangent plane counts more: where sheets face each other closely, the nearest node may be
+    on the wrong one.
+    """
     from scipy.spatial import cKDTree
 
-    away, nearest = cKDTree(nodes).query(points)
+    away, near = cKDTree(nodes).query(points, min(CANDIDATES, len(nodes)))
+    steps = points[:, None] - nodes[near]
+    above = np.abs(np.sum(steps * node_normals(nodes, faces)[near], axis=2))
+    best = np.argmin(away + ACROSS * above, axis=1)[:, None]
+    away, nearest = (np.take_along_axis(x, best, axis=1)[:, 0] for x in (away, near))
     step = np.einsum("pij,pj->pi", _gradients(nodes, faces, flat)[nearest], points - nodes[nearest])
     edge = np.median(np.linalg.norm(flat[faces[:, 0]] - flat[faces[:, 1]], axis=1))
     length = np.linalg.norm(step, axis=1, keepdims=True)
     step = step * np.minimum(1.0, REACH * edge / np.maximum(length, np.finfo(float).tiny))
     return flat[nearest] + np.where(away[:, None] > 0, step, 0.0), away
+
+
+def node_normals(nodes: np.ndarray, faces: Faces) -> Float[np.ndarray, "_ 3"]:
+    """Unit normals of the nodes, the means over their triangles."""
+    a, b, c = (nodes[faces[:, k]] for k in range(3))
+    total = np.zeros_like(nodes)
+    for k in range(3):
+        np.add.at(total, faces[:, k], np.cross(b - a, c - a))
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def _gradients(nodes: np.ndarray, faces: Faces, flat: np.ndarray) -> Float[np.ndarray, "nodes 2 3"]:

@@ -7,23 +7,13 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._scan._cleaning import Cleaned, cleaned
 from jaxfit._scan._extras import import_shapely
-from jaxfit._scan._flat_places import Rectangle, flat_places, rectangle_around
-from jaxfit._scan._hole_filling import filled_holes
-from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
-from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, manifold, pieces
-from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
-from jaxfit._scan._node_gradients import carried_places
-from jaxfit._scan._topology import largest_piece, sheet_loops
+from jaxfit._scan._flat_places import Rectangle, rectangle_around
+from jaxfit._scan._knot_density import break_points, knot_densities
+from jaxfit._scan._manifold import Faces, areas, manifold
+from jaxfit._scan._sheet_mesh import COVERED, MOST_NODES, sheet_mesh
 
 LEAST_POINTS = 12
-MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
-COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
-HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 OUTSET = 0.5  # of the spacing: how far beyond nodes that stand for several points the rim is
-GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
-FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
-LEAST_MARGIN, LARGEST_MARGIN = 0.02, 0.1  # of the domain
-COVERED = 0.75  # least share of the nodes on the largest piece
 
 
 class Sheet(NamedTuple):
@@ -38,6 +28,7 @@ class Sheet(NamedTuple):
     faces: Faces
     loops: list[Int[np.ndarray, " _"]]  # nodes around the sheet, the rim first, the sheet to the left
     sides: Float[np.ndarray, "2"]  # of the smallest rectangle around the sheet laid out flat
+    densities: Float[np.ndarray, "2 bins"]  # of knots along these
     centre: Float[np.ndarray, "3"]
     size: float
     spacing: float  # between nodes around it
@@ -46,15 +37,15 @@ class Sheet(NamedTuple):
     counts: dict[str, int]
 
     def layout(self, net: tuple[int, int], order: tuple[int, int]) -> "Layout":
-        """Parameters for a net, with a margin of one knot span around the sheet.
-
-        The control points on the border then have no influence on the sheet, if the net is not too coarse.
-        """
-        spans = np.asarray(net) - np.asarray(order) + 1
-        share = np.clip(1 / spans, LEAST_MARGIN, LARGEST_MARGIN)
-        whole = self.sides / (1 - 2 * share)
-        inside = np.clip(self.places / whole + share, share, 1 - share)
-        return Layout(inside, whole)
+        """Parameters and knots for a net, with a margin of half a knot span around the sheet."""
+        breaks = [
+            break_points(density, float(side), n - k + 1)
+            for density, side, n, k in zip(self.densities, self.sides, net, order, strict=True)
+        ]
+        low, whole = np.array([x[0] for x in breaks]), np.array([x[-1] - x[0] for x in breaks])
+        u, v = ((x - x[0]) / (x[-1] - x[0]) for x in breaks)
+        knots = np.pad(u, order[0] - 1, mode="edge"), np.pad(v, order[1] - 1, mode="edge")
+        return Layout((self.places - low) / whole, whole, knots)
 
     @property
     def area(self) -> float:
@@ -67,17 +58,7 @@ class Layout(NamedTuple):
 
     parameters: Float[np.ndarray, "kept 2"]
     sides: Float[np.ndarray, "2"]  # lengths that the square stands for
-
-
-class _Mesh(NamedTuple):
-    """Nodes, triangles, and places in the plane of the points."""
-
-    nodes: np.ndarray
-    faces: Faces
-    loops: list[np.ndarray]
-    flat: np.ndarray  # (nodes, 2)
-    places: np.ndarray  # (points, 2)
-    away: np.ndarray  # (points,) distance to the nearest node of the sheet
+    knots: tuple[Float[np.ndarray, " knots_u"], Float[np.ndarray, " knots_v"]]  # clamped
 
 
 def sheet_of(
@@ -96,7 +77,7 @@ def sheet_of(
     size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     cloud = (cloud - centre) / size
     asked = None if hole_length is None else hole_length / size
-    mesh, length = _mesh(cloud, _given_faces(points, clean, faces), asked)
+    mesh, length = sheet_mesh(cloud, _given_faces(points, clean, faces), asked)
     rectangle: Rectangle = rectangle_around(mesh.flat)
     on_sheet = mesh.away <= length
     places = np.clip(mesh.places @ rectangle.axes.T - rectangle.corner, 0.0, rectangle.sides)
@@ -107,13 +88,29 @@ def sheet_of(
         "outliers": clean.outliers,
         "off_the_sheet": int((~on_sheet).sum()),
     }
+    flat = mesh.flat @ rectangle.axes.T - rectangle.corner
+    densities = knot_densities(mesh.nodes, mesh.faces, flat, rectangle.sides)
     nearest = _nearest((points[np.isfinite(points).all(axis=1)] - centre) / size, cloud)
     spacing = float(np.median(np.concatenate([_steps(mesh.nodes[x]) for x in mesh.loops])))
     outset = 0.0 if len(mesh.nodes) <= len(cloud) < MOST_NODES else OUTSET * spacing
     return Sheet(
-        cloud, clean.kept, nearest, on_sheet, places, mesh.nodes, mesh.faces, mesh.loops, rectangle.sides,
-        centre, size, spacing, outset, length * size, counts,
-    )  # fmt: skip
+        points=cloud,
+        number=clean.kept,
+        nearest=nearest,
+        on_sheet=on_sheet,
+        places=places,
+        nodes=mesh.nodes,
+        faces=mesh.faces,
+        loops=mesh.loops,
+        sides=rectangle.sides,
+        densities=densities,
+        centre=centre,
+        size=size,
+        spacing=spacing,
+        outset=outset,
+        hole_length=length * size,
+        counts=counts,
+    )
 
 
 def _nearest(points: np.ndarray, cloud: np.ndarray) -> Int[np.ndarray, " points"]:
@@ -124,110 +121,6 @@ def _nearest(points: np.ndarray, cloud: np.ndarray) -> Int[np.ndarray, " points"
 
 def _steps(loop: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
-
-
-def _mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple[_Mesh, float]:
-    """The mesh of the cloud, and the length that decided what is a hole."""
-    if faces is not None:
-        longest = longest_edges(cloud, faces)
-        if length is not None:
-            faces = faces[longest <= length]
-        whole = largest_piece(cloud, faces)
-        whole = whole if length is None else filled_holes(cloud, whole, length)
-        reach = float(longest.max()) if length is None else length
-        return _laid_out(cloud, cloud, whole, faces, reach), reach
-    nodes = cloud if len(cloud) <= MOST_NODES else _even_choice(cloud)
-    reach = _hole_length(nodes) if length is None else length
-    found = neighbourhood_mesh(nodes, reach)
-    if (covered := _coverage(nodes, found)) < COVERED:
-        if is_level(cloud):
-            return _level(cloud, length)
-        found = neighbourhood_mesh(nodes, reach, least_votes=1)
-        covered = _coverage(nodes, found)
-    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
-    if covered < COVERED:
-        raise ValueError(
-            f"points must lie on one sheet, but neighbours agree on a surface for only "
-            f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
-            "hole_length where they are sparse."
-        )
-    return _laid_out(cloud, nodes, whole, found, reach), reach
-
-
-def _coverage(nodes: np.ndarray, faces: Faces) -> float:
-    """Triangles of the largest piece, over the number of a mesh with all nodes."""
-    return float(np.bincount(pieces(faces)).max()) / (2 * len(nodes)) if len(faces) else 0.0
-
-
-def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces, length: float) -> _Mesh:
-    """The largest piece of a mesh of nodes in space; all points get places from the nearest node.
-
-    Points of another piece of the mesh `before` are off the sheet, unless that piece is next to it.
-    """
-    used = in_use(faces, len(nodes))
-    stray = _next_to(cloud, nodes, _separate(nodes, before, used, GAP * length), used)
-    nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
-    loops = sheet_loops(nodes, faces)
-    flat = flat_places(nodes, faces, loops)
-    places, away = carried_places(cloud, nodes, faces, flat)
-    return _Mesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
-
-
-def _separate(nodes: np.ndarray, faces: Faces, used: np.ndarray, gap: float) -> np.ndarray:
-    """Nodes of other pieces that are farther away than the gap, or large."""
-    from scipy.spatial import cKDTree
-
-    tree, number, found = cKDTree(nodes[used]), pieces(faces), np.zeros(len(nodes), bool)
-    for piece in range(1, int(number.max()) + 1):
-        some = np.unique(faces[number == piece])
-        away = len(some) >= FLOCK or tree.query(nodes[some])[0].min() > gap
-        found[some] = away and not used[some].any()
-    return found
-
-
-def _next_to(cloud: np.ndarray, nodes: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Which points are nearer to some nodes than to others."""
-    from scipy.spatial import cKDTree
-
-    if not some.any():
-        return np.zeros(len(cloud), bool)
-    return cKDTree(nodes[some]).query(cloud)[0] < cKDTree(nodes[others]).query(cloud)[0]
-
-
-def _level(cloud: np.ndarray, length: float | None) -> tuple[_Mesh, float]:
-    """The sheet over the principal plane; lengths are measured in the plane."""
-    from scipy.spatial import cKDTree
-
-    frame = principal_frame(cloud)[0]
-    turned = cloud @ frame.T
-    nodes = level_nodes(turned, MOST_NODES).nodes
-    flat = nodes * [1, 1, 0]
-    reach = _hole_length(flat) if length is None else length
-    faces = largest_piece(flat, level_mesh(nodes, reach))
-    used = in_use(faces, len(nodes))
-    nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
-    away = cKDTree(nodes[:, :2]).query(turned[:, :2])[0]
-    loops = sheet_loops(nodes * [1, 1, 0], faces)
-    return _Mesh(nodes @ frame, faces, loops, nodes[:, :2], turned[:, :2], away), reach
-
-
-def _hole_length(nodes: np.ndarray) -> float:
-    from scipy.spatial import cKDTree
-
-    count = min(7, len(nodes))
-    sixth = cKDTree(nodes).query(nodes, count)[0][:, -1]
-    return HOLE_SPACINGS * float(np.percentile(sixth, COMMON_SPACING))
-
-
-def _even_choice(cloud: np.ndarray) -> np.ndarray:
-    """About `MOST_NODES` of the points, one from each cube that has any."""
-    size = 1.0 / np.sqrt(MOST_NODES)
-    while True:
-        cell = np.floor(cloud / size).astype(int)
-        _, first = np.unique(cell, axis=0, return_index=True)
-        if len(first) <= MOST_NODES:
-            return cloud[np.sort(first)]
-        size *= max(np.sqrt(len(first) / MOST_NODES), 1.02)
 
 
 def _given_faces(points: np.ndarray, clean: Cleaned, faces: Faces | None) -> Faces | None:

@@ -1,0 +1,135 @@
+"""The mesh of a cloud: by neighbours in space, from given faces, or over the principal plane."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxfit._scan._flat_places import flat_places
+from jaxfit._scan._hole_filling import filled_holes
+from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
+from jaxfit._scan._manifold import Faces, in_use, longest_edges, pieces
+from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
+from jaxfit._scan._node_gradients import carried_places
+from jaxfit._scan._topology import largest_piece, sheet_loops
+
+MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
+COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
+HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
+GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
+FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
+COVERED = 0.75  # least share of the nodes on the largest piece
+
+
+class SheetMesh(NamedTuple):
+    """Nodes, triangles, and places in the plane of the points."""
+
+    nodes: np.ndarray
+    faces: Faces
+    loops: list[np.ndarray]
+    flat: np.ndarray  # (nodes, 2)
+    places: np.ndarray  # (points, 2)
+    away: np.ndarray  # (points,) distance to the nearest node of the sheet
+
+
+def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple[SheetMesh, float]:
+    """The mesh of the cloud, and the length that decided what is a hole."""
+    if faces is not None:
+        longest = longest_edges(cloud, faces)
+        if length is not None:
+            faces = faces[longest <= length]
+        whole = largest_piece(cloud, faces)
+        whole = whole if length is None else filled_holes(cloud, whole, length)
+        reach = float(longest.max()) if length is None else length
+        return _laid_out(cloud, cloud, whole, faces, reach), reach
+    nodes = cloud if len(cloud) <= MOST_NODES else _even_choice(cloud)
+    reach = _hole_length(nodes) if length is None else length
+    found = neighbourhood_mesh(nodes, reach)
+    if (covered := _coverage(nodes, found)) < COVERED:
+        if is_level(cloud):
+            return _level(cloud, length)
+        found = neighbourhood_mesh(nodes, reach, least_votes=1)
+        covered = _coverage(nodes, found)
+    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
+    if covered < COVERED:
+        raise ValueError(
+            f"points must lie on one sheet, but neighbours agree on a surface for only "
+            f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
+            "hole_length where they are sparse."
+        )
+    return _laid_out(cloud, nodes, whole, found, reach), reach
+
+
+def _coverage(nodes: np.ndarray, faces: Faces) -> float:
+    """Triangles of the largest piece, over the number of a mesh with all nodes."""
+    return float(np.bincount(pieces(faces)).max()) / (2 * len(nodes)) if len(faces) else 0.0
+
+
+def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces, length: float) -> SheetMesh:
+    """The largest piece of a mesh of nodes in space; all points get places from the nearest node.
+
+    Points of another piece of the mesh `before` are off the sheet, unless that piece is next to it.
+    """
+    used = in_use(faces, len(nodes))
+    stray = _next_to(cloud, nodes, _separate(nodes, before, used, GAP * length), used)
+    nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
+    loops = sheet_loops(nodes, faces)
+    flat = flat_places(nodes, faces, loops)
+    places, away = carried_places(cloud, nodes, faces, flat)
+    return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
+
+
+def _separate(nodes: np.ndarray, faces: Faces, used: np.ndarray, gap: float) -> np.ndarray:
+    """Nodes of other pieces that are farther away than the gap, or large."""
+    from scipy.spatial import cKDTree
+
+    tree, number, found = cKDTree(nodes[used]), pieces(faces), np.zeros(len(nodes), bool)
+    for piece in range(1, int(number.max()) + 1):
+        some = np.unique(faces[number == piece])
+        away = len(some) >= FLOCK or tree.query(nodes[some])[0].min() > gap
+        found[some] = away and not used[some].any()
+    return found
+
+
+def _next_to(cloud: np.ndarray, nodes: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Which points are nearer to some nodes than to others."""
+    from scipy.spatial import cKDTree
+
+    if not some.any():
+        return np.zeros(len(cloud), bool)
+    return cKDTree(nodes[some]).query(cloud)[0] < cKDTree(nodes[others]).query(cloud)[0]
+
+
+def _level(cloud: np.ndarray, length: float | None) -> tuple[SheetMesh, float]:
+    """The sheet over the principal plane; lengths are measured in the plane."""
+    from scipy.spatial import cKDTree
+
+    frame = principal_frame(cloud)[0]
+    turned = cloud @ frame.T
+    nodes = level_nodes(turned, MOST_NODES).nodes
+    flat = nodes * [1, 1, 0]
+    reach = _hole_length(flat) if length is None else length
+    faces = largest_piece(flat, level_mesh(nodes, reach))
+    used = in_use(faces, len(nodes))
+    nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
+    away = cKDTree(nodes[:, :2]).query(turned[:, :2])[0]
+    loops = sheet_loops(nodes * [1, 1, 0], faces)
+    return SheetMesh(nodes @ frame, faces, loops, nodes[:, :2], turned[:, :2], away), reach
+
+
+def _hole_length(nodes: np.ndarray) -> float:
+    from scipy.spatial import cKDTree
+
+    count = min(7, len(nodes))
+    sixth = cKDTree(nodes).query(nodes, count)[0][:, -1]
+    return HOLE_SPACINGS * float(np.percentile(sixth, COMMON_SPACING))
+
+
+def _even_choice(cloud: np.ndarray) -> np.ndarray:
+    """About `MOST_NODES` of the points, one from each cube that has any."""
+    size = 1.0 / np.sqrt(MOST_NODES)
+    while True:
+        cell = np.floor(cloud / size).astype(int)
+        _, first = np.unique(cell, axis=0, return_index=True)
+        if len(first) <= MOST_NODES:
+            return cloud[np.sort(first)]
+        size *= max(np.sqrt(len(first) / MOST_NODES), 1.02)
