@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 
 from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
-from jaxfit._approximation._cloud_fit import LEAST_POINTS
+from jaxfit._approximation._cloud_fit import LEAST_POINTS, without_derivatives
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._base import AbstractBaseMethod, Boundary, Coons, base_surface, default_base, default_net
@@ -45,7 +45,8 @@ def fit_points(
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer.
     method, options
-        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors.
+        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors,
+        adjoint.
 
     Returns
     -------
@@ -56,7 +57,8 @@ def fit_points(
     ValueError
         As `base_surface` and `approximate` do, and if there is no boundary.
     TypeError
-        If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
+        If there is no such option, points are traced by `jit` or `vmap`, or the boundary by these or `grad`;
+        or if the fit is differentiated without a `net`.
 
     Notes
     -----
@@ -67,6 +69,10 @@ def fit_points(
     with three points for a control point. The last fit is one to all points. Each net takes at most
     20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than 20,000 points as
     many as the net needs, 48 for a control point, choose it.
+
+    With a `net` the fit is differentiable in points, weights and numbers of the method, as `approximate` is.
+    The base surface counts as constant then: inside, where it starts from does not matter to where the fit
+    comes to rest. Blend curves by `coons_surface` for derivatives with respect to the border.
 
     Examples
     --------
@@ -85,13 +91,23 @@ def fit_points(
         )
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
-    checked_request(cloud, method=method, **options)
-    if net is None and _may_grow(cloud, method, options):
+    fixed, known = without_derivatives((cloud, options))
+    checked_request(fixed, method=without_derivatives(method), **known)
+    if net is None and _may_grow(fixed, method, known):
+        _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options
         growth = NetGrowth(np.asarray(cloud), boundary, order, default_method(method), request)
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
-    return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
+    return approximate(cloud, _base(boundary, fixed, net, order, base), method, **options)
+
+
+def _check_no_derivative(cloud: Any, method: Any, options: dict[str, Any]) -> None:
+    if options.get("adjoint") is not None or not is_concrete(cloud, method, options):
+        raise TypeError(
+            "net must be given where a fit is differentiated, since a net that grows depends on the points by "
+            "jumps; pass for instance net=(20, 20)."
+        )
 
 
 def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int, int], base: Any) -> Any:
