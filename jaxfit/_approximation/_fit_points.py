@@ -105,8 +105,8 @@ def fit_points(
 def _check_no_derivative(cloud: Any, method: Any, options: dict[str, Any]) -> None:
     if options.get("adjoint") is not None or not is_concrete(cloud, method, options):
         raise TypeError(
-            "net must be given where a fit is differentiated, since a net that grows depends on the points by "
-            "jumps; pass for instance net=(20, 20)."
+            "net must be given where a fit is differentiated, since a net that grows depends on the points "
+            "by jumps; pass for instance net=(20, 20)."
         )
 
 
