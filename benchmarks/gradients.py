@@ -1,10 +1,11 @@
 """A fit beside its gradient, by public calls: time, stationarity, and a central difference.
 
-    python benchmarks/gradients.py --data FOLDER [--name igea_face] [--points 11500] [--net 42] [--smoothing 5e-6]
+    python benchmarks/gradients.py --data FOLDER [--name igea_face] [--points 11500] [--net 42]
+        [--smoothing 5e-6]
 
-`--data` is the folder of the data sets that the tests use. The gradient is that of one height of the surface in
-all points; its time includes the fit and the Newton steps to the surface at rest. Without `--smoothing` the
-default smoothing takes part. Times are medians of three after the first call, which is printed, too.
+`--data` is the folder of the data sets that the tests use. The gradient is that of one height of the
+surface in all points; its time includes the fit and the Newton steps to the surface at rest. Without
+`--smoothing` the default smoothing takes part. Times are medians of three after the first call, which is printed, too.
 """
 
 import argparse
@@ -27,9 +28,8 @@ def timed(work):
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--name", default="igea_face")
     parser.add_argument("--points", type=int, default=11500)
