@@ -5,7 +5,8 @@
 
 `--data` is the folder of the data sets that the tests use. The gradient is that of one height of the
 surface in all points; its time includes the fit and the Newton steps to the surface at rest. Without
-`--smoothing` the default smoothing takes part. Times are medians of three after the first call, which is printed, too.
+`--smoothing` the default smoothing takes part. Times are medians of three after the first call, which is
+printed, too.
 """
 
 import argparse

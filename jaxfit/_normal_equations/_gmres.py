@@ -75,7 +75,7 @@ def gmres_cycle(
     )
     projected = jnp.zeros((restart + 1, restart), right.dtype)
 
-    def extend(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def extend(state: Any) -> Any:
         k, basis, projected, rotations, _ = state
         new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
         scale = jnp.linalg.norm(new)
@@ -96,7 +96,7 @@ def gmres_cycle(
         left = size * jnp.abs(rotations[k + 1, 0])
         return k + 1, basis, projected.at[:, k].set(column), rotations, left
 
-    def unfinished(state: tuple[Array, ...]) -> Array:
+    def unfinished(state: Any) -> Array:
         return (state[0] < restart) & (state[4] > goal)
 
     begin = (jnp.asarray(0, jnp.int32), basis, projected, jnp.eye(restart + 1, dtype=right.dtype), size)
