@@ -174,7 +174,7 @@ def test_traced_points_are_refused_with_what_is_possible(method):
     with pytest.raises(TypeError, match=r"points must be concrete.*approximate\(points, base\)"):
         jax.jit(lambda x: base_surface(boundary, x, method=method))(points)
     with pytest.raises(TypeError, match=r"must be concrete.*approximate\(points, base\)"):
-        jax.grad(lambda x: jf.fit_points(x, boundary, base=method).average_error)(points)
+        jax.jit(lambda x: jf.fit_points(x, boundary, base=method).average_error)(points)
 
 
 def test_nets_not_asked_for_follow_one_rule():

@@ -14,9 +14,9 @@ WEIGHTS = RNG.uniform(0.5, 2.0, 200)
 EDGES = wavy_cloud(200)[1]
 PLACES = jnp.array([0.3, 0.7, 0.2]), jnp.array([0.4, 0.1, 0.8])
 FACTORS = jnp.array([[1.0, -2.0, 3.0]])
-NEAR = wavy_cloud(200)[0]
+AT_ROUNDING = jf.ImplicitAdjoint(residual=0.0)
 
-# Each with the base surface's net and order, and the points.
+# Each with a number, and the net and the order of the base surface.
 CASES = {
     "plate": (lambda x: jf.OrthogonalDistance(smoothing=x), 1e-5, (6, 7), (4, 4)),
     "default": (lambda x: jf.OrthogonalDistance(jf.RegularSmoothing(least=x)), 5.0, (6, 7), (4, 4)),
@@ -39,7 +39,7 @@ CASES = {
         (6, 7),
         (4, 4),
     ),
-    "geometric": (lambda x: jf.GeometricApproximation(loss=jf.Huber(scale=x)), 0.05, (6, 7), (4, 4)),
+    "geometric": (lambda x: jf.GeometricApproximation(loss=jf.Huber(scale=x)), 5e-3, (6, 7), (4, 4)),
 }
 
 
@@ -49,6 +49,15 @@ def base_of(net, order):
     inside = np.zeros((*net, 3))
     inside[1:-1, 1:-1] = 0.003 * np.random.default_rng(2).normal(size=(net[0] - 2, net[1] - 2, 3))
     return jf.BSplineSurface(base.control_points + inside, base.knots_u, base.knots_v)
+
+
+def near(base):
+    """Points near a surface with the net of `base`: without smoothing others do not determine a net."""
+    rng = np.random.default_rng(5)
+    bump = np.zeros(base.control_points.shape)
+    bump[1:-1, 1:-1, 2] = 0.1 * rng.normal(size=(base.shape[0] - 2, base.shape[1] - 2))
+    surface = jf.BSplineSurface(base.control_points + bump, base.knots_u, base.knots_v)
+    return np.asarray(surface(*rng.uniform(size=(2, 400)))) + 1e-3 * rng.normal(size=(400, 3))
 
 
 def height(method, base, points, weights, number, net, adjoint=None):
@@ -72,32 +81,119 @@ def central_difference(function, arguments, place, direction, step):
 @pytest.mark.parametrize("name", CASES)
 def test_the_derivative_is_that_of_the_polished_fit(name):
     method, number, net, order = CASES[name]
-    points = NEAR if name == "geometric" else POINTS
     base = base_of(net, order)
-    arguments = (points, WEIGHTS, number, np.asarray(base.control_points))
+    points = near(base) if name == "geometric" else POINTS
+    weights = np.resize(WEIGHTS, len(points))
+    arguments = (points, weights, number, np.asarray(base.control_points))
     both = jax.value_and_grad(lambda *x: height(method, base, *x), argnums=(0, 1, 2, 3), has_aux=True)
     (value, stationarity), gradient = both(*arguments)
     assert stationarity <= 1e-12
 
     def polished(*x):
-        return height(method, base, *x, adjoint=jf.ImplicitAdjoint())[0]
+        return height(method, base, *x, adjoint=AT_ROUNDING)[0]
 
-    np.testing.assert_allclose(polished(*arguments), value, rtol=1e-12)
+    np.testing.assert_allclose(polished(*arguments), value, rtol=1e-9)
     rng = np.random.default_rng(3)
     directions = [rng.normal(size=np.shape(x)) for x in arguments[:2]] + [number]
     directions.append(rng.normal(size=arguments[3].shape))
     for place, direction in enumerate(directions):
         # So short that hardly a foot reaches a border of the domain, where the derivative jumps.
-        step = (1e-7, 1e-6, 1e-5, 1e-7)[place]
+        step, least = (1e-7, 1e-5, 1e-4, 1e-6)[place], (1e-7, 1e-7, 1e-7, 1e-6)[place]
         difference = central_difference(polished, arguments, place, direction, step)
         slope = float(jnp.sum(gradient[place] * direction))
-        assert abs(slope - difference) <= 1e-6 * abs(difference) + 1e-8, (place, slope, difference)
+        assert abs(slope - difference) <= 1e-6 * abs(difference) + least, (place, slope, difference)
     tangents = [jnp.asarray(x, float) for x in directions]
     forward = jax.jvp(
         lambda *x: height(method, base, *x)[0], [jnp.asarray(x, float) for x in arguments], tangents
     )
     backward = sum(float(jnp.sum(g * x)) for g, x in zip(gradient, tangents, strict=True))
-    np.testing.assert_allclose(float(forward[1]), backward, rtol=1e-8)
+    np.testing.assert_allclose(float(forward[1]), backward, rtol=1e-7)
     if name in ("plate", "default"):
         inside = np.asarray(gradient[3])[1:-1, 1:-1]
         assert not inside.any()  # where the fit starts from does not matter
+
+
+BASE = base_of((6, 7), (4, 4))
+
+
+def plate_height(points, weights, adjoint=None):
+    method = jf.OrthogonalDistance(smoothing=1e-5)
+    options = dict(tol_average=1e-12, max_steps=40, weights=weights, adjoint=adjoint)
+    fit = jf.approximate(points, BASE, method, **options)
+    return jnp.sum(fit.surface(*PLACES) * FACTORS)
+
+
+def test_gradients_run_in_jit_and_vmap():
+    slope = jax.grad(plate_height, argnums=(0, 1))
+    single = slope(POINTS, WEIGHTS)
+    clouds = jnp.stack([POINTS, POINTS * 1.01])
+    batch = jax.jit(jax.vmap(slope, (0, None)))(clouds, WEIGHTS)
+    for one, many in zip(single, batch, strict=True):
+        np.testing.assert_allclose(many[0], one, rtol=1e-6, atol=1e-9)
+
+
+def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right_derivative():
+    special = np.asarray(BASE(jnp.array([0.0, 1.0, 0.0, 0.4]), jnp.array([0.3, 1.0, 0.0, 0.0])))
+    outside = np.array([[-0.1, -0.1, 0.0], [0.5, -0.05, 0.02]])
+    points = np.concatenate([POINTS, special, outside, POINTS[:1], POINTS[:1]])
+    weights = np.concatenate([WEIGHTS, np.ones(7), [0.0]])
+    gradient = jax.grad(plate_height, argnums=(0, 1))(points, weights)
+    assert all(np.isfinite(x).all() for x in gradient)
+    direction = np.zeros(points.shape)
+    direction[200:] = np.random.default_rng(0).normal(size=(8, 3))
+    direction[[0, 206]] = 1.0
+    direction[200:204] = 0.0  # on the border, where the derivative is one-sided
+
+    def polished(*x):
+        return plate_height(*x, adjoint=AT_ROUNDING)
+
+    difference = central_difference(polished, (points, weights), 0, direction, 1e-7)
+    np.testing.assert_allclose(jnp.sum(gradient[0] * direction), difference, rtol=1e-6, atol=1e-7)
+    more = weights.copy()
+    more[-1] = 1e-6
+    one_sided = float(polished(points, more) - polished(points, weights)) / 1e-6
+    np.testing.assert_allclose(gradient[1][-1], one_sided, rtol=1e-4)
+    assert not np.asarray(gradient[0][-1]).any()  # the point of weight 0
+
+
+def test_a_surface_that_is_not_at_rest_says_so():
+    early = dict(max_steps=2, tol_average=1e-12)
+    fit = jf.approximate(POINTS, BASE, **early, adjoint=jf.ImplicitAdjoint(polish_steps=0))
+    assert float(fit.stats["stationarity"]) > 1e-4
+    assert "stationarity" not in jf.approximate(POINTS, BASE, **early).stats
+
+
+def test_methods_that_do_not_come_to_rest_refuse_with_a_sentence():
+    for method in (jf.GeometricApproximation.paper(), jf.GeometricApproximation(local=True)):
+
+        def error(points, method=method):
+            return jf.approximate(points, BASE, method, max_steps=1).average_error
+
+        with pytest.raises(TypeError, match="has no derivative"):
+            jax.grad(error)(jnp.asarray(POINTS))
+
+
+def test_numbers_of_a_method_may_be_traced():
+    @jax.jit
+    def errors(relaxation, scale, reach, least):
+        geometric = jf.GeometricApproximation(relaxation=relaxation, loss=jf.Huber(scale=scale))
+        smooth = jf.OrthogonalDistance(jf.RegularSmoothing(least=least), reach=reach)
+        fits = [jf.approximate(POINTS, BASE, m, max_steps=2) for m in (geometric, smooth)]
+        return jnp.stack([fit.average_error for fit in fits])
+
+    assert np.isfinite(errors(1.1, 0.05, 0.5, 4.0)).all()
+
+
+def test_a_cloud_with_its_boundary_is_differentiable_in_its_points():
+    boundary = jf.Boundary(**EDGES)
+    method = jf.OrthogonalDistance(smoothing=1e-5)
+
+    def height(points, adjoint=None):
+        options = dict(net=(6, 7), method=method, tol_average=1e-12, max_steps=40, base=jf.Coons())
+        return jf.fit_points(points, boundary, **options, adjoint=adjoint).surface(0.4, 0.6)[2]
+
+    direction = np.random.default_rng(0).normal(size=POINTS.shape)
+    difference = central_difference(lambda x: height(x, AT_ROUNDING), (POINTS,), 0, direction, 1e-7)
+    np.testing.assert_allclose(jnp.sum(jax.grad(height)(POINTS) * direction), difference, rtol=1e-6)
+    with pytest.raises(TypeError, match="net must be given"):
+        jax.grad(lambda x: jf.fit_points(x, boundary).average_error)(np.tile(POINTS, (3, 1)))

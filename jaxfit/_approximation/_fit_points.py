@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._checked_scan import checked_scan
-from jaxfit._approximation._cloud_fit import LEAST_POINTS
+from jaxfit._approximation._cloud_fit import LEAST_POINTS, without_derivatives
 from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
@@ -71,8 +71,9 @@ def fit_points(
         boundary. Default: twice the distance of the sixth neighbour, of 99 % of the points; given faces are
         all kept.
     method, options
-        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors.
-        Without a boundary there is no `start`, and `errors` is LocalFeet() by default.
+        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors,
+        adjoint. Without a boundary there are no `start` and no `adjoint`, and `errors` is LocalFeet() by
+        default.
 
     Returns
     -------
@@ -89,7 +90,8 @@ def fit_points(
         As `base_surface` and `approximate` do. Without a boundary also if the points make no sheet: a disc,
         with or without holes.
     TypeError
-        If there is no such option, or points or boundary are traced by `jit`, `vmap` or `grad`.
+        If there is no such option, points are traced by `jit` or `vmap`, or the boundary by these or `grad`;
+        or if the fit is differentiated without a `net` or without a boundary.
     ImportError
         Without a boundary, if shapely (the extra `scan`) is not installed.
 
@@ -112,6 +114,10 @@ def fit_points(
     their heights. Fails where two sheets are nearer to each other than their points, for closed surfaces,
     tubes and several pieces, and where noise is coarser than the points are dense and the cloud is not level.
     Of more than 30,000 points an even choice makes the mesh, and faces are not used.
+
+    With a `net` the fit is differentiable in points, weights and numbers of the method, as `approximate` is.
+    The base surface counts as constant then: inside, where it starts from does not matter to where the fit
+    comes to rest. Blend curves by `coons_surface` for derivatives with respect to the border.
 
     Examples
     --------
@@ -142,13 +148,23 @@ def fit_points(
                 "either."
             )
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
-    checked_request(cloud, method=method, **options)
-    if net is None and _may_grow(cloud, method, options):
+    fixed, known = without_derivatives((cloud, options))
+    checked_request(fixed, method=without_derivatives(method), **known)
+    if net is None and _may_grow(fixed, method, known):
+        _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options
         growth = NetGrowth(np.asarray(cloud), BoundaryNets(boundary, order), default_method(method), request)
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
     net = default_net(cloud.shape[0], boundary, order) if net is None else net
-    return approximate(cloud, _base(boundary, cloud, net, order, base), method, **options)
+    return approximate(cloud, _base(boundary, fixed, net, order, base), method, **options)
+
+
+def _check_no_derivative(cloud: Any, method: Any, options: dict[str, Any]) -> None:
+    if options.get("adjoint") is not None or not is_concrete(cloud, method, options):
+        raise TypeError(
+            "net must be given where a fit is differentiated, since a net that grows depends on the points "
+            "by jumps; pass for instance net=(20, 20)."
+        )
 
 
 def _parts(data: Any, boundary: Any, faces: Any) -> tuple[Any, Any, Any]:
@@ -173,6 +189,11 @@ def _without_boundary(
     base: Any,
     options: dict[str, Any],
 ) -> Fit:
+    if options.get("adjoint") is not None:
+        raise TypeError(
+            "adjoint must be None where no boundary is given, for the sheet depends on the points by jumps; "
+            "leave it out, or pass a boundary and a net."
+        )
     scan = checked_scan(points, faces, hole_length, base, options.get("start"))
     finite = np.isfinite(scan.points).all(axis=1)
     if finite.any():  # or else `fit_scan` says what is wrong

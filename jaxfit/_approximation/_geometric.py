@@ -289,13 +289,13 @@ class GeometricApproximation(AbstractIterativeMethod):
         """The weighted means around all control points that move vanish."""
         if self.fairing is not None:
             raise TypeError(
-                "adjoint must be UnrolledAdjoint() for a method with fairing, whose surfaces do not come to "
-                "rest; pass that, or fairing=None."
+                "a fit with fairing has no derivative, since its surfaces do not come to rest; pass "
+                "fairing=None."
             )
         if self.local:
             raise TypeError(
-                "adjoint must be UnrolledAdjoint() for a method with local=True, which leaves some control "
-                "points where they are; pass that, or local=False."
+                "a fit with local=True has no derivative, since some control points stay where they are; "
+                "pass local=False."
             )
         weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
         held = held_points(self.border, surface.control_points.shape, surface.used)

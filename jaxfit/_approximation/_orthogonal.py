@@ -288,14 +288,15 @@ class OrthogonalDistance(AbstractIterativeMethod):
     def stationarity(
         self, problem: Problem, surface: WorkingSurface, state: OrthogonalState, error: Array
     ) -> Stationarity:
-        """Half the gradient of F; the factors of RegularSmoothing are those of the last step."""
+        """Half the gradient of F. Factors of RegularSmoothing count as constant, but for those at `least`."""
         length = loss_length(self.loss, problem, error)
         if state.guard is None:
             smoothing = as_smoothing(self.smoothing, error.dtype) * jnp.sum(problem.weight)
             penalty: AbstractPenalty = WeightedPlate(plate_of(state.plate, surface), smoothing)
         else:
             cost = total_cost(self.loss, length, problem.weight, error)
-            penalty = self.smoothing.penalty(state.guard, surface, problem, cost)
+            guard = self.smoothing.following_least(state.guard)
+            penalty = self.smoothing.penalty(guard, surface, problem, cost)
         held = held_points(self.border, surface.control_points.shape, surface.used)
         return Stationarity(reweighted(self.loss, length, problem.weight, error), held, penalty)
 

@@ -27,7 +27,7 @@ from jaxfit._precision import default_foot_tolerance
 ACCURACY, MOST_CYCLES = 1e-3, 3  # of the linear systems of the steps
 REACH = 0.6  # of the distance between control points: the longest move in a step
 # The ratio of the actual to the predicted work: above GOOD the shift falls, below POOR it rises.
-GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.1, 4.0
+GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.3, 4.0
 FIRST_SHIFT, TAKEN_BACK, LEAST_SHIFT, MOST_SHIFT = 1e-4, 10.0, 1e-8, 1e2
 GROWTH = 4.0  # of |G| in an accepted step
 
@@ -99,7 +99,7 @@ def polished(
         new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), terms, least)
         work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
         good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
-        shift = _next_shift(now, work, good)
+        shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
 
         def step() -> tuple[Array, Array]:
             system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
@@ -121,10 +121,11 @@ def polished(
     return PolishedFit(end.net, end.projection, free, share)
 
 
-def _next_shift(now: _State, work: Array, good: Array) -> Array:
-    """mu of the next step, from the work that this one was predicted to do."""
+def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:
+    """mu of the next step, from the work that this one was predicted to do, and the ratio of |G|."""
     ratio = work / jnp.where(now.predicted < 0, now.predicted, -1.0)
-    factor = jnp.where(ratio > GOOD, LOWERED, jnp.where(ratio < POOR, RAISED, 1.0))
+    lowered = jnp.minimum(LOWERED, fall)
+    factor = jnp.where(ratio > GOOD, lowered, jnp.where(ratio < POOR, RAISED, 1.0))
     fallen = factor * now.shift
     fallen = jnp.where(fallen < LEAST_SHIFT, 0.0, fallen)
     taken_back = jnp.maximum(TAKEN_BACK * now.shift, FIRST_SHIFT)

@@ -148,6 +148,11 @@ class RegularSmoothing(eqx.Module):
         least = jnp.full_like(guard.factor, self.least)
         return FoldGuard(least, least, *(jnp.zeros_like(least),) * 2, guard.folds).seeing(surface)
 
+    def following_least(self, guard: "FoldGuard") -> "FoldGuard":
+        """With factors that have fallen to `least` as functions of it, for derivatives."""
+        factor = jnp.where(guard.factor <= jax.lax.stop_gradient(self.least), self.least, guard.factor)
+        return eqx.tree_at(lambda g: g.factor, guard, factor)
+
     def held_back(
         self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, here: Projection
     ) -> Bool[Array, " points"]:

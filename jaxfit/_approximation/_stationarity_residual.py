@@ -23,7 +23,7 @@ from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
 
-ROUNDING = 64.0  # rounding units of the sums of G: what is left of them counts as zero
+ROUNDING = 8.0  # rounding units of the sums of G: what is left of them counts as zero
 
 
 class FeetInRows(eqx.Module):

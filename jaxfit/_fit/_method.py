@@ -144,11 +144,11 @@ class AbstractIterativeMethod(eqx.Module):
         `state` is the last one, and `error` are the distances of the points, here those of `surface`. It is
         differentiated with respect to the points, the weights, the control points and the method's numbers,
         so these have to come from the arguments, not from the state. A method need not have this function;
-        its fits then have no `ImplicitAdjoint`.
+        its fits then have no derivative.
         """
         raise TypeError(
-            f"adjoint must be UnrolledAdjoint() for {type(self).__name__}, which names no condition that its "
-            "final surface meets; pass that, or give the method a function `stationarity`."
+            f"a fit by {type(self).__name__} has no derivative, since it names no condition that its final "
+            "surface meets; give it a function `stationarity`."
         )
 
 

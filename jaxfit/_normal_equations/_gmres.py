@@ -1,7 +1,7 @@
 """Restarted GMRES (Saad and Schultz, SIAM J. Sci. Stat. Comput. 7, 1986), preconditioned from the left."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -45,7 +45,7 @@ def gmres(
 
     def cycle(state: State) -> State:
         x, residual, before, cycles, _ = state
-        moved = x + gmres_cycle(apply, precondition, residual, restart)
+        moved = x + gmres_cycle(apply, precondition, residual, restart, goal)
         rest = right - apply(moved)
         after = size(rest)
         better = after < before
@@ -59,11 +59,13 @@ def gmres(
     return GmresSolution(x, left / jnp.where(first > 0, first, 1.0), cycles)
 
 
-def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: int) -> Array:
-    """One cycle from zero: the x of the Krylov space for which M (right - A x) is smallest.
+def gmres_cycle(
+    apply: Operator, precondition: Operator, right: Array, restart: int, goal: Any = 0.0
+) -> Array:
+    """One cycle from zero: the x of the Krylov space for which M (right - A x) is smallest, or `goal`.
 
     Twice classical Gram-Schmidt. An exhausted space adds zero vectors, which the least-squares problem leaves
-    alone.
+    alone. Rotations of its rows say how much of the residual is left.
     """
     first = precondition(right).reshape(-1)
     size = jnp.linalg.norm(first)
@@ -73,8 +75,8 @@ def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: 
     )
     projected = jnp.zeros((restart + 1, restart), right.dtype)
 
-    def extend(k: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        basis, projected = state
+    def extend(state: Any) -> Any:
+        k, basis, projected, rotations, _ = state
         new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
         scale = jnp.linalg.norm(new)
         once = basis @ new
@@ -85,9 +87,20 @@ def gmres_cycle(apply: Operator, precondition: Operator, right: Array, restart: 
         fresh = length > 10 * info.eps * scale
         length = jnp.where(fresh, length, 0.0)
         basis = basis.at[k + 1].set(jnp.where(fresh, new / jnp.where(fresh, length, 1.0), 0.0))
-        return basis, projected.at[:, k].set((once + twice).at[k + 1].set(length))
+        column = (once + twice).at[k + 1].set(length)
+        turned = rotations @ column
+        radius = jnp.sqrt(turned[k] ** 2 + turned[k + 1] ** 2)
+        radius = jnp.where(radius > 0, radius, 1.0)
+        c, s, upper, lower = turned[k] / radius, turned[k + 1] / radius, rotations[k], rotations[k + 1]
+        rotations = rotations.at[k].set(c * upper + s * lower).at[k + 1].set(c * lower - s * upper)
+        left = size * jnp.abs(rotations[k + 1, 0])
+        return k + 1, basis, projected.at[:, k].set(column), rotations, left
 
-    basis, projected = lax.fori_loop(0, restart, extend, (basis, projected))
-    goal = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
-    weights = jnp.linalg.lstsq(projected, goal)[0]
+    def unfinished(state: Any) -> Array:
+        return (state[0] < restart) & (state[4] > goal)
+
+    begin = (jnp.asarray(0, jnp.int32), basis, projected, jnp.eye(restart + 1, dtype=right.dtype), size)
+    _, basis, projected, _, _ = lax.while_loop(unfinished, extend, begin)
+    target = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
+    weights = jnp.linalg.lstsq(projected, target)[0]
     return (weights @ basis[:-1]).reshape(right.shape)
