@@ -33,9 +33,10 @@ def test_points_of_weight_zero_have_no_influence(base, name):
     alone = jf.approximate(POINTS, base, METHODS[name], **OPTIONS)
     padded = jf.approximate(cloud, base, METHODS[name], weights=weights, **OPTIONS)
     difference = np.asarray(alone.surface.control_points - padded.surface.control_points)
-    assert np.abs(difference).max() < (1e-7 if name in MAGNIFIES else 1e-10)
-    np.testing.assert_allclose(alone.history.average, padded.history.average, rtol=1e-7)
-    assert np.isclose(alone.average_error, padded.average_error, rtol=1e-7)
+    assert np.abs(difference).max() < (1e-6 if name in MAGNIFIES else 1e-10)
+    rtol = 1e-5 if name in MAGNIFIES else 1e-7
+    np.testing.assert_allclose(alone.history.average, padded.history.average, rtol=rtol)
+    assert np.isclose(alone.average_error, padded.average_error, rtol=rtol)
     assert float(padded.errors[200:].min()) > 0
 
 
@@ -50,7 +51,7 @@ def test_a_batch_of_fits_is_the_fits_one_by_one(base, name):
     single = jax.jit(net)
     for one, cloud in zip(batch, clouds, strict=True):
         apart = np.abs(np.asarray(one - single(cloud))).max()
-        assert apart < (1e-7 if name in MAGNIFIES else 1e-12)
+        assert apart < (1e-6 if name in MAGNIFIES else 1e-12)
 
 
 def test_other_values_of_numbers_compile_nothing(base):
