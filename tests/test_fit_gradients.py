@@ -163,6 +163,21 @@ def test_a_surface_that_is_not_at_rest_says_so():
     assert "stationarity" not in jf.approximate(POINTS, BASE, **early).stats
 
 
+def test_a_derivative_far_from_rest_is_refused():
+    method = jf.OrthogonalDistance(smoothing=1e-5)
+
+    def slope(adjoint):
+        def place(points):
+            fit = jf.approximate(points, BASE, method, tol_average=1e-9, max_steps=1, adjoint=adjoint)
+            return fit.surface.control_points[2, 2, 2]
+
+        return jax.grad(place)(jnp.asarray(POINTS))
+
+    with pytest.raises(ArithmeticError, match=r"not at rest .* pass a number as smoothing"):
+        slope(jf.ImplicitAdjoint(polish_steps=0))
+    np.testing.assert_allclose(slope(jf.ImplicitAdjoint()), slope(None), rtol=1e-9)
+
+
 def test_methods_that_do_not_come_to_rest_refuse_with_a_sentence():
     for method in (jf.GeometricApproximation.paper(), jf.GeometricApproximation(local=True)):
 

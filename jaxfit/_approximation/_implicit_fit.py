@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
@@ -21,6 +22,7 @@ from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
     stationarity_residual,
 )
+from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
 from jaxfit._fit._adjoints import ImplicitAdjoint
@@ -34,6 +36,7 @@ from jaxfit._splines._lookup import windows
 
 # Relative accuracy of the linear system of a derivative, in roots of the rounding unit.
 ACCURACY = 0.75
+TRUSTED = 1e-3  # a greater |G|, relative to its terms, is of no surface near rest
 
 
 class FitInputs(eqx.Module):
@@ -84,12 +87,29 @@ def with_implicit_derivative(
 def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any) -> Any:
     _, end, inputs = primals
     at_rest = polished_fit(rest, adjoint, end, lax.stop_gradient(inputs))
+    _check_at_rest(adjoint, at_rest.stationarity)
     return jax.jvp(partial(_implicit, rest, at_rest, end), (inputs,), tangents[2:])
 
 
+def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
+    """Raise where the derivative would be that of no surface; within `jit` the number is all there is."""
+    if not is_concrete(stationarity):
+        return
+    found, goal = float(np.max(np.asarray(stationarity))), adjoint.goal(np.asarray(stationarity).dtype)
+    if not found <= max(TRUSTED, goal):
+        raise ArithmeticError(
+            f"the fit has no derivative here: after up to {adjoint.polish_steps} Newton steps its surface is "
+            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, goal):.0e}); pass a number as "
+            "smoothing, fewer control points, or ImplicitAdjoint(polish_steps=...) with more steps."
+        )
+
+
 def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Fitted:
-    """The polished fit of concrete inputs."""
-    return _implicit(rest, polished_fit(rest, adjoint, end, inputs), end, inputs)
+    """The polished fit, with its derivative in the inputs."""
+    at_rest = polished_fit(rest, adjoint, end, lax.stop_gradient(inputs))
+    if not is_concrete(inputs):
+        _check_at_rest(adjoint, at_rest.stationarity)
+    return _implicit(rest, at_rest, end, inputs)
 
 
 @partial(compiled, static_argnums=(0, 1))

@@ -66,7 +66,7 @@ class ImplicitAdjoint(AbstractAdjoint):
     polished: Newton steps on G. The fit that is differentiated, and any fit that `adjoint=ImplicitAdjoint()`
     is passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms
     of the terms of G. Read it: above about 1e-6 the surface could not be polished, and the derivative is not
-    to be trusted.
+    to be trusted; above 1e-3 differentiating raises an ArithmeticError, and inside `jit` may give NaN.
 
     Of an interpolation: the derivative at held parameters and knots, $dP = N(\hat u, \hat v)^{-1} dQ$. Any
     parameters at which the surface meets the data solve the interpolation problem, so this is the derivative
