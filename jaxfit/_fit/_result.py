@@ -66,9 +66,9 @@ class Fit(eqx.Module):
     """
 
     surface: BSplineSurface
-    u: Float[Array, "..."]
-    v: Float[Array, "..."]
-    errors: Float[Array, "..."]
+    u: Float[Any, "..."]
+    v: Float[Any, "..."]
+    errors: Float[Any, "..."]
     average_error: Float[Array, ""]
     maximum_error: Float[Array, ""]
     history: History
