@@ -19,8 +19,8 @@ def approximate_stream(
     source: Source,
     base: BSplineSurface,
     method: AbstractIterativeMethod | None = None,
-    tol_average: float | None = 6e-4,
-    tol_maximum: float | None = None,
+    tol_average: ArrayLike | None = 6e-4,
+    tol_maximum: ArrayLike | None = None,
     max_steps: int = 200,
     weights: ArrayLike | None = None,
     start: Any = None,
@@ -77,9 +77,10 @@ def approximate_stream(
 
     Notes
     -----
-    Between passes parameters are kept as fixed-point numbers of 32 bits, $2.3 \cdot 10^{-10}$ of the domain
-    apart. Feet that converge start from them, so they cost no digit of the surface. Feet that do not, with
-    `single_step` or without `parameter_correction`, carry that rounding, $10^{-10}$ of the extent at most.
+    Between passes parameters are kept as fixed-point numbers of 48 bits, $3.6 \cdot 10^{-15}$ of the domain
+    apart, so the surface is that of `approximate` to rounding. The exception is
+    `GeometricApproximation(single_step=False)`: there feet start from the last ones, in `approximate` ahead
+    of them, so a point with several feet may go to another one.
     Not under `jit`, `vmap` or `grad`.
 
     Examples

@@ -8,15 +8,17 @@ from jaxtyping import Float
 
 from jaxfit._precision import working_dtype
 
-STEPS = 2**32 - 1  # of a parameter's domain: 2.3e-10 of it each
+STEPS = 2**48 - 1  # of a parameter's domain: 3.6e-15 of it each
+HALF = 0xFFFF
 
 
 class StoredFeet:
     """u, v and the error of every point, in an array (3, points) of 32-bit words.
 
-    During the fit, parameters are fixed-point numbers, which are 250 times as fine as numbers of single
-    precision next to 1. At the end, `finish` replaces them, in place, by ordinary numbers in single
-    precision. With `file` the array is mapped to a new `.npy` file.
+    During the fit, parameters are fixed-point numbers of 48 bits: the upper 32 of u and of v in rows of their
+    own, the lower 16 of both in the row of the errors, which nobody needs yet. At the end, `finish` replaces
+    them, in place, by ordinary numbers in single precision. With `file` the array is mapped to a new `.npy`
+    file.
     """
 
     def __init__(self, count: int, domain: Any, file: str | os.PathLike[str] | None):
@@ -26,21 +28,24 @@ class StoredFeet:
             self.rows = np.empty(shape, np.float32)
         else:
             self.rows = np.lib.format.open_memmap(file, "w+", np.float32, shape)
-        self._fixed = self.rows[:2].view(np.uint32)
+        self._words = self.rows.view(np.uint32)
         self._low, self._high = np.asarray(domain, np.float64).T[..., None]
 
     def read(self, start: int, count: int) -> Float[np.ndarray, "2 count"]:
         """(u, v) of points numbered from `start` on."""
-        share = self._fixed[:, start : start + count].astype(np.float64) / STEPS
-        found = self._low + share * (self._high - self._low)
+        upper_u, upper_v, lower = self._words[:, start : start + count].astype(np.int64)
+        steps = np.stack([upper_u << 16 | lower >> 16, upper_v << 16 | lower & HALF])
+        found = self._low + steps / STEPS * (self._high - self._low)
         return np.minimum(found, self._high).astype(working_dtype())
 
     def write(self, start: int, u: Any, v: Any) -> None:
         """Replace those of the points from `start` on."""
         feet = np.stack([u, v]).astype(np.float64)
         share = (feet - self._low) / (self._high - self._low)
-        share = np.clip(np.nan_to_num(share), 0.0, 1.0)
-        self._fixed[:, start : start + feet.shape[1]] = np.rint(share * STEPS).astype(np.uint32)
+        steps = np.rint(np.clip(np.nan_to_num(share), 0.0, 1.0) * STEPS).astype(np.int64)
+        lower = steps & HALF
+        words = np.stack([*(steps >> 16), lower[0] << 16 | lower[1]])
+        self._words[:, start : start + feet.shape[1]] = words
 
     def finish(self, start: int, u: Any, v: Any, errors: Any) -> None:
         """The last feet and the errors of the points from `start` on, which are not read again."""
