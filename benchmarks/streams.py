@@ -31,13 +31,15 @@ METHODS = {"standard": jf.StandardApproximation, "geometric": jf.GeometricApprox
 
 def write_sheet(path, count):
     """A wavy sheet with noise, at random places."""
-    file = np.lib.format.open_memmap(path, "w+", np.float64, (count, 3))
     rng = np.random.default_rng(0)
-    for start in range(0, count, AT_ONCE):
-        u, v = rng.random((2, min(AT_ONCE, count - start)))
-        z = 0.2 * np.sin(9 * u) * np.cos(7 * v) + 0.02 * np.sin(60 * u * v)
-        z += 2e-4 * rng.normal(size=u.size)
-        file[start : start + u.size] = np.stack([u + 0.05 * np.sin(5 * v), v, z], axis=-1)
+    with open(path, "wb") as file:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (count, 3)}
+        np.lib.format.write_array_header_1_0(file, header)
+        for start in range(0, count, AT_ONCE):
+            u, v = rng.random((2, min(AT_ONCE, count - start)))
+            z = 0.2 * np.sin(9 * u) * np.cos(7 * v) + 0.02 * np.sin(60 * u * v)
+            z += 2e-4 * rng.normal(size=u.size)
+            np.stack([u + 0.05 * np.sin(5 * v), v, z], axis=-1).astype("<f8").tofile(file)
 
 
 def smooth_base(shape):

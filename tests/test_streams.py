@@ -135,6 +135,19 @@ def bad_block():
     return blocks
 
 
+def test_files_that_cannot_be_used_are_refused(base, tmp_path):
+    path, archive = tmp_path / "points.npy", tmp_path / "points.npz"
+    np.save(path, POINTS)
+    np.savez(archive, points=POINTS)
+    with pytest.raises(ValueError, match=r"feet_file must be a file of its own, but .*points\.npy is read"):
+        jf.approximate_stream(path, base, feet_file=path)
+    assert np.array_equal(np.load(path), POINTS)
+    with pytest.raises(
+        ValueError, match=r"source must be the path of a \.npy file, but .*points\.npz is none"
+    ):
+        jf.approximate_stream(archive, base)
+
+
 REFUSED = {
     "NaN": (bad_block(), r"block 1 of source, from point 1000 on, must be finite, .* index \(17, 2\); rem"),
     "shape": ([POINTS, POINTS[:, :2]], "block 1 of source, from point 3000 on, must have 3 coordinates"),

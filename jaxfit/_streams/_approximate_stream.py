@@ -55,10 +55,10 @@ def approximate_stream(
     start : pair of arrays (points,), optional
         Feet (u, v) on the base surface to start from; default the closest points, searched globally.
     block_size : int
-        The number of points at a time (default 262,144). One program is compiled for it, and each core of a
-        CPU works on a block of its own.
+        The number of points at a time (default 262,144). One program is compiled for it. Up to four cores of
+        a CPU work on a block each.
     feet_file : path, optional
-        A new `.npy` file, mapped to an array (3, points), that holds u, v and errors instead of memory.
+        A `.npy` file to be written, with an array (3, points) of u, v and errors, instead of memory.
 
     Returns
     -------

@@ -24,7 +24,7 @@ class Blocks:
         self.source, self.dimension, self.size = source, dimension, size
         self.count: int | None = None  # known once all have been read
         if isinstance(source, (str, os.PathLike)):
-            self.source = np.load(source, mmap_mode="r")
+            self.source = _mapped(source)
         if isinstance(self.source, np.ndarray):
             _check_shape(self.source, dimension)
         elif not callable(source) and (not isinstance(source, Iterable) or iter(source) is source):
@@ -64,6 +64,19 @@ class Blocks:
                 for begin in range(0, len(source), self.size)
             )
         return source() if callable(source) else source  # type: ignore[return-value]
+
+
+def _mapped(path: str | os.PathLike[str]) -> np.ndarray:
+    """The array of a file, not read yet."""
+    try:
+        with open(path, "rb") as file:
+            np.lib.format.read_magic(file)
+    except ValueError as error:
+        raise ValueError(
+            f"source must be the path of a .npy file, but {os.fspath(path)} is none; save the points by "
+            "np.save, or pass a function that returns an iterator of arrays."
+        ) from error
+    return np.load(path, mmap_mode="r")
 
 
 def _check_shape(source: np.ndarray, dimension: int) -> None:

@@ -25,6 +25,9 @@ from jaxfit._streams._blocks import Blocks, Points
 from jaxfit._streams._methods import static_and_numbers
 from jaxfit._streams._stored_feet import StoredFeet
 
+# Blocks at a time. More would take memory, and a search for first feet has threads of its own.
+MOST_THREADS = 4
+
 
 class Measured(NamedTuple):
     """Sums over the points of one block, or of all of them."""
@@ -149,19 +152,19 @@ def _padded(x: np.ndarray, size: int) -> np.ndarray:
 
 
 def in_threads(work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-    """`work` on every item, in order, a thread for each core and hardly more items at a time than those.
+    """`work` on every item, in order, a few at a time.
 
     The first item goes alone, for it compiles what the others use.
     """
-    cores = os.cpu_count() or 1
+    threads = min(os.cpu_count() or 1, MOST_THREADS)
     waiting: deque[Future[Any]] = deque()
-    with ThreadPoolExecutor(cores) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         for number, item in enumerate(items):
             if number == 0:
                 yield work(item)
                 continue
             waiting.append(pool.submit(work, item))
-            if len(waiting) > cores:
+            if len(waiting) > threads:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()

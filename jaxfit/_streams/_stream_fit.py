@@ -13,7 +13,7 @@ from jax import Array
 from jaxfit._approximation._checked_arguments import check_options, checked_start, checked_weights
 from jaxfit._approximation._cloud_fit import LEAST_POINTS, fitted_surface, tolerances_of, working_surface
 from jaxfit._approximation._errors import GlobalFeet
-from jaxfit._checks import check_kind, check_number, is_concrete
+from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, record_and_move
@@ -39,38 +39,19 @@ def fit_stream(
     request: dict[str, Any],
 ) -> Fit:
     """`approximate_stream`, the options that it shares with `approximate` in a dictionary."""
-    goals, max_steps = (request["tol_average"], request["tol_maximum"]), request["max_steps"]
-    weights, progress, throw, errors = (request[x] for x in ("weights", "progress", "throw", "errors"))
-    check_kind("base", base, BSplineSurface, "base_surface(boundary)")
-    check_options(method, *goals, max_steps, progress, throw, errors)
-    _check_concrete(base, method, request)
-    check_number("block_size", block_size, 1, whole=True)
-    streamed = by_sums(method)
-    for tolerance in goals:
-        if tolerance is not None:
-            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
-    blocks = Blocks(source, base.dimension, block_size)
-    count, unit = _count_and_unit(blocks, weights)
-    weight = checked_weights(weights, count)
-    stored = StoredFeet(count, base.domain, feet_file)
-    if request["start"] is not None:
-        u, v = checked_start(request["start"], count, base.domain)
-        for k in range(0, count, block_size):
-            stored.write(k, u[k : k + block_size], v[k : k + block_size])
-    tolerances = tolerances_of(*goals, max_steps)
-    passes = Passes(
-        blocks, None if weight is None else np.asarray(weight), unit, tolerances, stored, streamed
-    )
+    streamed = _checked_method(base, method, block_size, request)
+    passes = _opened(source, base, streamed, block_size, feet_file, request)
+    unit = passes.unit
     begun = working_surface(base, unit, True)
-    nothing = make_problem(np.zeros((0, base.dimension)), None, unit, tolerances, padded=False)
+    nothing = make_problem(np.zeros((0, base.dimension)), None, unit, passes.tolerances, padded=False)
     none = np.zeros(0, working_dtype())
-    loop = begin(streamed, nothing, begun, none, none, max_steps)
+    loop = begin(streamed, nothing, begun, none, none, request["max_steps"])
     searched = base if request["start"] is None else None
-    loop = _run(passes, nothing, loop, searched, progress)
+    loop = _run(passes, nothing, loop, searched, request["progress"])
     stats = _postprocess(*static_and_numbers(streamed), nothing, loop)
     surface = fitted_surface(loop, base, begun, unit)
     lost = int(loop.code) == code_of(RESULTS.diverged)  # the stored feet are those of a surface given up
-    errors = GlobalFeet() if errors is None else errors
+    errors = GlobalFeet() if request["errors"] is None else request["errors"]
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
     stats = {
         "method": Name(type(method).__name__),
@@ -80,8 +61,47 @@ def fit_stream(
         "passes": passes.made + 1,  # with the first, which finds the unit
         **stats,
     }
-    fit = _fit(loop, stored, surface, average, maximum, stats, getattr(method, "fairing", None))
-    return converged_or_raise(fit) if throw else fit
+    fit = _fit(loop, passes.feet, surface, average, maximum, stats, getattr(method, "fairing", None))
+    return converged_or_raise(fit) if request["throw"] else fit
+
+
+def _checked_method(
+    base: BSplineSurface, method: AbstractIterativeMethod, block_size: int, request: dict[str, Any]
+) -> AbstractIterativeMethod:
+    """The method by sums; raises if an argument is not valid, before anything is read."""
+    goals = request["tol_average"], request["tol_maximum"]
+    options = (request[x] for x in ("max_steps", "progress", "throw", "errors"))
+    check_kind("base", base, BSplineSurface, "base_surface(boundary)")
+    check_options(method, *goals, *options)
+    _check_concrete(base, method, request)
+    check_number("block_size", block_size, 1, whole=True)
+    for tolerance in goals:
+        if tolerance is not None:
+            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
+    return by_sums(method)
+
+
+def _opened(
+    source: Source,
+    base: BSplineSurface,
+    method: AbstractIterativeMethod,
+    block_size: int,
+    feet_file: str | os.PathLike[str] | None,
+    request: dict[str, Any],
+) -> Passes:
+    """The points, seen once, with their weights and first feet."""
+    weights, start = request["weights"], request["start"]
+    blocks = Blocks(source, base.dimension, block_size)
+    weights = None if weights is None else np.asarray(as_floating("weights", weights, 1))
+    _check_file(feet_file, (blocks.source, request["weights"], *(start if isinstance(start, tuple) else ())))
+    count, unit = _count_and_unit(blocks, weights)
+    weights = checked_weights(weights, count)
+    feet = None if start is None else checked_start(start, count, base.domain)
+    stored = StoredFeet(count, base.domain, feet_file)
+    for k in () if feet is None else range(0, count, block_size):
+        stored.write(k, *(x[k : k + block_size] for x in feet or ()))
+    tolerances = tolerances_of(request["tol_average"], request["tol_maximum"], request["max_steps"])
+    return Passes(blocks, weights, unit, tolerances, stored, method)
 
 
 def _check_concrete(base: BSplineSurface, method: Any, request: dict[str, Any]) -> None:
@@ -90,6 +110,16 @@ def _check_concrete(base: BSplineSurface, method: Any, request: dict[str, Any]) 
             "approximate_stream must be called outside transformations, since it reads its points on the "
             "host, but an argument is traced; fit in memory by approximate there."
         )
+
+
+def _check_file(path: str | os.PathLike[str] | None, inputs: tuple[Any, ...]) -> None:
+    """Raise if the file to be written is one that is read."""
+    for x in inputs:
+        file = getattr(x, "filename", None)
+        if path is not None and file is not None and os.path.realpath(path) == os.path.realpath(file):
+            raise ValueError(
+                f"feet_file must be a file of its own, but {os.fspath(path)} is read as well; name another."
+            )
 
 
 def _count_and_unit(blocks: Blocks, weights: Any) -> tuple[int, Unit]:
