@@ -91,6 +91,7 @@ from jaxfit._splines import clamped_uniform_knots as clamped_uniform_knots
 from jaxfit._splines import greville_abscissae as greville_abscissae
 from jaxfit._splines import insertion_matrix as insertion_matrix
 from jaxfit._splines import merge_knots as merge_knots
+from jaxfit._streams import approximate_stream as approximate_stream
 from jaxfit._trimmed import TrimmedSurface as TrimmedSurface
 
 

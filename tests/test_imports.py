@@ -27,6 +27,7 @@ ROOMS = [
     ("_fit",),
     ("_interpolation",),
     ("_approximation",),
+    ("_streams",),
     ("_batch",),
     ("io",),
     ("plot",),

@@ -80,7 +80,8 @@ def approximate(
     -----
     Section 4 of Kineri, Wang, Lin and Maekawa (2012). Runs under `jit` and `vmap`; on a CPU a batch is fitted
     one after the other. Outside transformations clouds are padded to one of four sizes per octave, so that a
-    second cloud of similar size compiles nothing.
+    second cloud of similar size compiles nothing. `approximate_stream` fits clouds larger than
+    memory.
 
     Fits are differentiable with respect to points, weights, the control points of `base`, and numbers of the
     method such as lambda. Control points of the base that move have the derivative 0: where the fit starts

@@ -35,6 +35,24 @@ def checked_request(
 
     `domain` is that of the base surface, where there is one.
     """
+    check_options(method, tol_average, tol_maximum, max_steps, progress, throw, errors, adjoint)
+    count = points.shape[0]
+    feet = None if start is None else checked_start(start, count, domain)
+    weight = checked_weights(weights, count)
+    return unit_of(_counted(points, weight)), weight, feet
+
+
+def check_options(
+    method: Any,
+    tol_average: Any,
+    tol_maximum: Any,
+    max_steps: Any,
+    progress: Any,
+    throw: Any,
+    errors: Any,
+    adjoint: Any = None,
+) -> None:
+    """Raise unless the options of a fit are valid that say nothing about single points."""
     check_switch("throw", throw)
     if method is not None:
         check_kind("method", method, AbstractIterativeMethod, "OrthogonalDistance()")
@@ -51,10 +69,6 @@ def checked_request(
             f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "
             "maximum)."
         )
-    count = points.shape[0]
-    feet = None if start is None else _checked_start(start, count, domain)
-    weight = _checked_weights(weights, count)
-    return unit_of(_counted(points, weight)), weight, feet
 
 
 def _counted(points: Any, weight: Any) -> Any:
@@ -72,7 +86,7 @@ def _counted(points: Any, weight: Any) -> Any:
     return jnp.where((weight > 0)[:, None], points, first[None])
 
 
-def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
+def checked_weights(weights: ArrayLike | None, count: int) -> Any:
     """One weight for each point, or None."""
     if weights is None:
         return None
@@ -89,7 +103,7 @@ def _checked_weights(weights: ArrayLike | None, count: int) -> Any:
     return weight
 
 
-def _checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
+def checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
     """One foot for each point, within the domain if that is given."""
     if not isinstance(start, (tuple, list)) or len(start) != 2:
         raise ValueError("start must be a pair (u, v) of parameter arrays; pass start=(u, v).")

@@ -54,9 +54,9 @@ def fit_cloud(
         if tolerance is not None and is_concrete(tolerance):
             advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
     concrete = is_concrete(cloud, base, weight, request["start"], goals, method)
-    tolerances = _tolerances(*goals, max_steps)
+    tolerances = tolerances_of(*goals, max_steps)
     problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
-    begun = _working_surface(base, unit, concrete)
+    begun = working_surface(base, unit, concrete)
     if feet is None:
         nearest = closest_point(base, cloud)
         feet = nearest.u, nearest.v
@@ -67,7 +67,7 @@ def fit_cloud(
     together = problem.ordered(order)
     loop = begin(method, together, begun, u[order], v[order], max_steps)
     loop, stats = run(method, together, loop, request["progress"] if concrete else None)
-    surface = _fitted(loop, base, begun, unit)
+    surface = fitted_surface(loop, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
     if request["adjoint"] is not None or not is_concrete(given):
         here = loop.current
@@ -136,7 +136,8 @@ def _differentiable(
     return surface, (fitted.u, fitted.v, fitted.error, known[3]), unit, fitted.stationarity
 
 
-def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:
+def tolerances_of(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerances:
+    """The limits of a fit; None sets none."""
     dtype, parts = working_dtype(), []
     for x in (tol_average, tol_maximum):
         xp: Any = np if is_concrete(x) else jnp
@@ -144,7 +145,7 @@ def _tolerances(tol_average: Any, tol_maximum: Any, max_steps: int) -> Tolerance
     return Tolerances(parts[0], parts[1], np.asarray(max_steps, np.int32))
 
 
-def _working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> WorkingSurface:
+def working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> WorkingSurface:
     """The base surface in the unit of the problem."""
     dtype = working_dtype()
     xp: Any = np if concrete else jnp
@@ -177,7 +178,9 @@ def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
     return xp.argsort(cell.astype(np.uint16) if cells < 1 << 16 else cell, stable=True)
 
 
-def _fitted(loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit) -> BSplineSurface:
+def fitted_surface(
+    loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit
+) -> BSplineSurface:
     """The fitted surface in the user's unit. Control points that have not moved keep every bit.
 
     Inside transformations a net with room for knots keeps its surplus control points.

@@ -115,13 +115,19 @@ def _iterate(
 
 def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> LoopState:
     """Measure, accept, record, decide, move."""
-    running, diverged = code_of(RESULTS.running), code_of(RESULTS.diverged)
     old, new = loop.current, loop.next
     projection, state = method.measure(problem, new, loop.exact)
     new = Iterate(new.surface, projection, state, new.step)
     new = lax.cond(new.step > 0, lambda: method.accept(problem, old, new), lambda: new)
+    return record_and_move(method, problem, loop, new, problem.summarise(new.projection, old.projection))
+
+
+def record_and_move(
+    method: AbstractIterativeMethod, problem: Problem, loop: LoopState, new: Iterate, errors: Array
+) -> LoopState:
+    """Record the `errors` of an iterate that has been measured and accepted, decide, and move."""
+    running, diverged = code_of(RESULTS.running), code_of(RESULTS.diverged)
     counts = jnp.concatenate([new.projection.active[None], jnp.asarray(new.surface.used)])
-    errors = problem.summarise(new.projection, old.projection)
     history = loop.history.append(new.step, errors, counts)
     code = _decide(method, problem, new, history)
     again = (code != running) & (code != diverged) & ~new.projection.exact

@@ -70,12 +70,19 @@ class Problem(eqx.Module):
 
         The last two are per foot: evaluations of the surface, and change of the parameters u plus v.
         """
+        sums, maximum = self.totals(projection, before)
+        average, evaluations, change = sums / jnp.sum(self.counted)
+        return jnp.stack([average, maximum, evaluations, change])
+
+    def totals(
+        self, projection: Projection, before: Projection
+    ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+        """Sums of errors, evaluations and changes over the points of positive weight; the greatest error."""
         change = jnp.abs(projection.u - before.u) + jnp.abs(projection.v - before.v)
         evaluations = projection.evaluations.astype(change.dtype)
         rows = jnp.stack([projection.error / self.diagonal, evaluations, change])
         rows = jnp.where(self.counted[None], rows, 0.0)
-        average, evaluations, change = jnp.sum(rows, axis=1) / jnp.sum(self.counted)
-        return jnp.stack([average, jnp.max(rows[0]), evaluations, change])
+        return jnp.sum(rows, axis=1), jnp.max(rows[0])
 
 
 def make_problem(

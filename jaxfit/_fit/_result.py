@@ -31,7 +31,8 @@ class Fit(eqx.Module):
     ----------
     surface : BSplineSurface
     u, v : array (points,), or (n, m) for a grid
-        Parameters of the foot point of every data point.
+        Parameters of the foot point of every data point. With `errors` in single precision from
+        `approximate_stream`, which gives NumPy arrays.
     errors : array (points,), or (n, m) for a grid
         |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. Errors of an
         interpolation include a bound on the rounding of the control points. They do not include the rounding
@@ -66,9 +67,9 @@ class Fit(eqx.Module):
     """
 
     surface: BSplineSurface
-    u: Float[Array, "..."]
-    v: Float[Array, "..."]
-    errors: Float[Array, "..."]
+    u: Float[Any, "..."]
+    v: Float[Any, "..."]
+    errors: Float[Any, "..."]
     average_error: Float[Array, ""]
     maximum_error: Float[Array, ""]
     history: History

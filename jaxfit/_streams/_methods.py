@@ -1,0 +1,131 @@
+"""Methods whose moves need sums over the points only: their `state.sums`, added up block by block."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxfit._approximation import GaussNewton, GeometricApproximation, StandardApproximation
+from jaxfit._approximation._automatic_smoothing import AbstractSmoothing
+from jaxfit._approximation._smoothing_term import plate_of
+from jaxfit._approximation._standard import StandardState
+from jaxfit._fit._history import ErrorHistory
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
+from jaxfit._fit._problem import Problem
+from jaxfit._fit._projection import Projection
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._normal_equations import NormalOperator, Stencil, free_points, normal_solver
+from jaxfit._precision import working_dtype
+
+
+class NormalSums(eqx.Module):
+    """A^T W A, and A^T W (A P - Q) for the present net P."""
+
+    stencil: Stencil
+    gradient: Float[Any, "nu nv d"]
+
+
+class StateWithSums(StandardState):
+    """The state of `StandardApproximation`, and the sums that its next move needs."""
+
+    sums: NormalSums
+
+
+class StandardBySums(StandardApproximation):
+    """`StandardApproximation` whose points are summed up where they are measured."""
+
+    def init(
+        self, problem: Problem, surface: WorkingSurface, projection: Projection
+    ) -> tuple[WorkingSurface, StateWithSums]:
+        """The state with zeros for sums."""
+        surface, state = super().init(problem, surface, projection)
+        net = surface.control_points
+        entries = np.zeros((*surface.order, *net.shape[:2]), net.dtype)
+        sums = NormalSums(Stencil(entries), np.zeros_like(net))
+        return surface, StateWithSums(state.smoothing, state.shift, state.plate, sums)
+
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StateWithSums]:
+        """Feet, and the sums at them."""
+        projection, state = super().measure(problem, iterate, exact)
+        surface = iterate.surface
+        system = self.system(problem, surface, projection, state.smoothing, state.plate)
+        gradient = system.data_adjoint(system.data_residual(surface.control_points))
+        sums = NormalSums(system.data_stencil(), gradient)
+        return projection, StateWithSums(state.smoothing, state.shift, state.plate, sums)
+
+    def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
+        """The least-squares net, by a correction of the present one."""
+        surface, state = iterate.surface, iterate.state
+        net, plate, sums = surface.control_points, plate_of(state.plate, surface), state.sums
+        stencil = sums.stencil.plus(plate.stencil(), state.smoothing)
+        free = free_points(stencil, self.held(surface))
+        gradient = sums.gradient + state.smoothing * plate.adjoint(plate.residual(net))
+        operator = NormalOperator(stencil, free, net.shape[2])
+        solver: Any = normal_solver(operator)
+        factors = solver.init(operator, {})
+        step, _, _ = solver.compute(factors, jnp.where(free[:, :, None], gradient, 0.0), {})
+        moved = surface.moved_to(jnp.where(free[:, :, None], net - step, net))
+        shift = jnp.maximum(state.shift, getattr(factors, "shift", jnp.zeros((), net.dtype)))
+        state = StateWithSums(state.smoothing, shift, state.plate, sums)
+        return Iterate(moved, iterate.projection, state, iterate.step + 1), history
+
+
+class GeometricBySums(GeometricApproximation):
+    """`GeometricApproximation` without a state of single points.
+
+    Converged feet start where they were, not ahead: their last move would have to be stored.
+    """
+
+    @property
+    def _extrapolates(self) -> bool:
+        return False
+
+
+_BY_SUMS: dict[type, type] = {
+    StandardApproximation: StandardBySums,
+    GeometricApproximation: GeometricBySums,
+}
+
+
+def by_sums(method: AbstractIterativeMethod) -> AbstractIterativeMethod:
+    """The method, kept to sums over the points; raises if it needs more."""
+    kind = _BY_SUMS.get(type(method))
+    if kind is None:
+        raise TypeError(
+            "method must be StandardApproximation() or GeometricApproximation(), whose moves follow from "
+            f"sums over the points, but is {type(method).__name__}(); pass one of these, or fit in memory by "
+            "approximate(points, base, method)."
+        )
+    fields = {x.name: getattr(method, x.name) for x in dataclasses.fields(method)}
+    _check_fields(fields)
+    return kind(**fields)
+
+
+def static_and_numbers(method: AbstractIterativeMethod) -> tuple[Any, Any]:
+    """The static fields of a method, and its numbers as arrays: what compiled programs take."""
+    numbers, rest = dynamic_fields(method)
+    return rest, jax.tree.map(lambda x: np.asarray(x, working_dtype()), numbers)
+
+
+def _check_fields(fields: dict[str, Any]) -> None:
+    """Raise for an option that looks at all points together."""
+    loss = fields["loss"]
+    refused = {
+        "insertion": ("None", fields["insertion"] is not None),
+        "local": ("False", fields.get("local", False)),
+        "smoothing": ("lambda, a number", isinstance(fields.get("smoothing"), AbstractSmoothing)),
+        "solver": ("GaussNewton()", not isinstance(fields.get("solver", GaussNewton()), GaussNewton)),
+        "loss": (f"{type(loss).__name__}(scale)", loss is not None and loss.scale is None),
+    }
+    for name, (instead, wrong) in refused.items():
+        if wrong:
+            raise ValueError(
+                f"the method's {name} must be {instead} where points are read in blocks, but is "
+                f"{fields[name]!r}, which looks at all points together; pass {instead}, or fit in memory by "
+                "approximate."
+            )
