@@ -36,7 +36,8 @@ def distances(net, knots, points):
     for _ in range(STEPS):
         residual = points - surface(foot)
         nearest = np.minimum(nearest, np.linalg.norm(residual, axis=1))
-        step = _step(*(surface(foot, nu=nu) for nu in ((1, 0), (0, 1))), residual)
+        along = [surface(foot, nu=nu) for nu in ((1, 0), (0, 1))]
+        step = _step(*along, residual, foot <= low, foot >= high)
         foot = np.clip(foot + step, low, high)
     return np.minimum(nearest, np.linalg.norm(points - surface(foot), axis=1))
 
@@ -67,8 +68,12 @@ def _on_grid(net, knots, degrees, axes, nu=(0, 0)):
     return net
 
 
-def _step(along_u, along_v, residual):
+def _step(along_u, along_v, residual, at_low, at_high):
+    """A Gauss-Newton step; a parameter that would leave the domain stays."""
     a, b, c = (np.sum(x * y, axis=1) for x, y in ((along_u,) * 2, (along_u, along_v), (along_v,) * 2))
-    p, q = (np.sum(x * residual, axis=1) for x in (along_u, along_v))
+    downhill = np.stack([np.sum(x * residual, axis=1) for x in (along_u, along_v)], axis=1)
+    held = (at_low & (downhill < 0)) | (at_high & (downhill > 0))
+    p, q = np.where(held, 0.0, downhill).T
+    b = np.where(held.any(axis=1), 0.0, b)
     det = np.maximum(a * c - b * b, 1e-14 * a * c + 1e-300)
     return np.stack([(c * p - b * q) / det, (a * q - b * p) / det], axis=1)
