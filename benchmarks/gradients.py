@@ -20,7 +20,8 @@ GRID_METHODS = {"geometric": jf.GeometricInterpolation(), "standard": jf.Standar
 def fits(report, options):
     """Gradient of a height of the fitted surface in all points and in lambda."""
     note = (
-        "`agreement`: relative difference from a central difference along one random direction of the points."
+        "`agreement`: relative difference from a central difference along a random direction of the points. "
+        "No derivative can be trusted where `stationarity`, of the fit at rest, is not small."
     )
     report.table("Gradients of fits of clouds", note)
     for count, net in CASES[: 1 if options.quick else None]:
@@ -55,6 +56,7 @@ def _row(report, points, base, name, method, runs):
         highest_s=max(done["gradient"].later),
         in_fits=done["gradient"].median / done["fit"].median,
         differences_in_fits=2 * points.size,
+        stationarity=float(fitted(points, jf.ImplicitAdjoint()).stats["stationarity"]),
         agreement=abs(slope / difference - 1),
     )
 

@@ -1,4 +1,4 @@
-"""Run all notebooks beside this file, or those that are named; fails where a cell does.
+"""Run the first block of Python in the README and all notebooks, or those that are named; fails where one does.
 
     python notebooks/execute.py [--write] [NAME.ipynb ...]
 
@@ -6,6 +6,8 @@ With --write the outputs are kept in the files.
 """
 
 import argparse
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -13,6 +15,12 @@ import nbformat
 from nbclient import NotebookClient
 
 HERE = Path(__file__).resolve().parent
+
+
+def execute_readme():
+    """Run the first block of Python in the README, as a reader would paste it."""
+    block = (HERE.parent / "README.md").read_text().split("```python\n")[1].split("```")[0]
+    subprocess.run([sys.executable, "-c", block], cwd=HERE.parent, check=True)
 
 
 def execute(path, write):
@@ -33,6 +41,8 @@ def main():
     parser.add_argument("notebooks", nargs="*", type=Path)
     parser.add_argument("--write", action="store_true", help="keep the outputs")
     options = parser.parse_args()
+    if not options.notebooks:
+        execute_readme()
     for path in options.notebooks or sorted(HERE.glob("*.ipynb")):
         execute(path, options.write)
 
