@@ -7,7 +7,7 @@ import numpy as np
 import jaxfit as jf
 from benchmarks import _inputs
 from benchmarks._referee import judged_surface
-from benchmarks._timing import timed
+from benchmarks._timing import in_turns, timed
 
 # Net, iterations, maximum error in % and seconds of the paper's models, geometric | standard.
 PAPER = {
@@ -67,12 +67,11 @@ def table_5(report, options):
     note = "Errors by the referee, in %. No fairing, no new knots: all methods get the same base and net."
     report.table("Table 5: approximation of clouds", note)
     for cloud, base in prepared(options.stand_ins, options.quick):
-        for name, method in methods(cloud.smoothing).items():
-
-            def work(cloud=cloud, base=base, method=method):
-                return jf.approximate(cloud.points, base, method, tol_average=cloud.target)
-
-            found = timed(work, options.runs)
+        works = {
+            name: functools.partial(jf.approximate, cloud.points, base, method, tol_average=cloud.target)
+            for name, method in methods(cloud.smoothing).items()
+        }
+        for name, found in in_turns(works, options.runs).items():
             fit = found.result
             report.row(
                 model=f"{cloud.role} ({cloud.source})",

@@ -1,11 +1,13 @@
 """Tables 1 to 3 and Figures 1 and 2 of the paper: interpolation of grids, and symmetry."""
 
+import functools
+
 import numpy as np
 
 import jaxfit as jf
 from benchmarks import _inputs
 from benchmarks._referee import judged_surface
-from benchmarks._timing import timed
+from benchmarks._timing import in_turns
 
 UNIT = jf.UnitWeights()
 PLAIN, HELD, WEIGHTED, BOTH = "plain", "feet held", "repositioning", "both"
@@ -30,13 +32,12 @@ def tables(report, options):
     for grid in _inputs.grids(options.stand_ins):
         if options.quick and grid.role != "hood":
             continue
-        done = {}
-        for name, method in METHODS.items():
-
-            def work(method=method, points=grid.points):
-                return jf.interpolate(points, method, tolerance=TOLERANCE, max_steps=600)
-
-            found = done[name] = timed(work, options.runs)
+        works = {
+            name: functools.partial(jf.interpolate, grid.points, method, tolerance=TOLERANCE, max_steps=600)
+            for name, method in METHODS.items()
+        }
+        done = in_turns(works, options.runs)
+        for name, found in done.items():
             fit = found.result
             report.row(
                 model=f"{grid.role} ({grid.source})",
