@@ -1,6 +1,6 @@
 """Base surfaces of scanned clouds: distance of the cloud from each, and of the fits that start there.
 
-    python benchmarks/bases.py [--data FOLDER] [--max-steps N] [--spoil KIND ...] [name ...]
+    python -m benchmarks bases [--data FOLDER] [--max-steps N] [--spoil KIND ...] [name ...]
 
 Distances are to true closest points, in % of the diagonal of the cloud's bounding box. Fits are those of the
 default method, to the average error named or for as many iterations as allowed. `folds` are those of

@@ -1,6 +1,6 @@
 """Closest points: time a point, warm and cold, and how many feet are wrong.
 
-    python benchmarks/closest_point.py [--points 100000] [--runs 9] [--data FOLDER]
+    python -m benchmarks closest_point [--points 100000] [--runs 9] [--data FOLDER]
 
 Queries lie 1-5 % of the diagonal off the surface. Times are medians over the runs, with the spread (lowest
 to highest); the first call, which compiles, is listed apart. A foot is wrong if a dense sampling with a

@@ -1,71 +1,89 @@
-"""A fit beside its gradient, by public calls: time, stationarity, and a central difference.
-
-    python benchmarks/gradients.py --data FOLDER [--name igea_face] [--points 11500] [--net 42]
-        [--smoothing 5e-6]
-
-`--data` is the folder of the data sets that the tests use. The gradient is that of one height of the
-surface in all points; its time includes the fit and the Newton steps to the surface at rest. Without
-`--smoothing` the default smoothing takes part. Times are medians of three after the first call, which is
-printed, too.
-"""
-
-import argparse
-import statistics
-import time
-from pathlib import Path
+"""What a gradient through a fit costs, beside the fit, and whether central differences agree."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-jax.config.update("jax_enable_x64", True)
-
 import jaxfit as jf
+from benchmarks._referee import judged_surface
+from benchmarks._timing import in_turns
+from benchmarks.scaling import cloud
+
+CASES = ((300, 8), (3_000, 16))
+METHODS = {
+    "standard": jf.StandardApproximation(smoothing=1e-4),
+    "orthogonal distance": jf.OrthogonalDistance(smoothing=1e-5),
+}
+GRID_METHODS = {"geometric": jf.GeometricInterpolation(), "standard": jf.StandardInterpolation()}
 
 
-def timed(work):
-    begun = time.perf_counter()
-    result = jax.block_until_ready(work())
-    return result, time.perf_counter() - begun
+def fits(report, options):
+    """Gradient of a height of the fitted surface in all points and in lambda."""
+    note = (
+        "`agreement`: relative difference from a central difference along a random direction of the points. "
+        "No derivative can be trusted where `stationarity`, of the fit at rest, is not small."
+    )
+    report.table("Gradients of fits of clouds", note)
+    for count, net in CASES[: 1 if options.quick else None]:
+        points, boundary = cloud(count)
+        points = points + 0.003 * np.random.default_rng(1).normal(size=points.shape)
+        base = jf.base_surface(boundary, net=(net, net))
+        for name, method in METHODS.items():
+            _row(report, points, base, name, method, options.runs)
 
 
-def main():
-    layout = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--name", default="igea_face")
-    parser.add_argument("--points", type=int, default=11500)
-    parser.add_argument("--net", type=int, default=42)
-    parser.add_argument("--smoothing", type=float)
-    options = parser.parse_args()
-    with np.load(options.data / f"{options.name}.npz") as arrays:
-        points = arrays["points"]
-        boundary = jf.Boundary(*(arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")))
-    rng = np.random.default_rng(0)
-    points = points[rng.permutation(len(points))[: options.points]]
-    base = jf.base_surface(boundary, points, net=(options.net,) * 2, method=jf.Meshless())
-    smoothing = {} if options.smoothing is None else {"smoothing": options.smoothing}
-    method = jf.OrthogonalDistance(**smoothing)
+def _row(report, points, base, name, method, runs):
+    def fitted(points, adjoint=None):
+        return jf.approximate(points, base, method, tol_average=1e-12, max_steps=40, adjoint=adjoint)
 
     def height(points, adjoint=None):
-        fit = jf.approximate(points, base, method, tol_average=1e-9, errors=jf.LocalFeet(), adjoint=adjoint)
-        return fit.surface(0.4, 0.6)[2], fit
+        return jnp.sum(fitted(points, adjoint).surface(jnp.array([0.3, 0.6]), jnp.array([0.4, 0.7]))[..., 2])
 
-    works = {
-        "fit": lambda: height(points)[0],
-        "gradient": lambda: jax.value_and_grad(height, has_aux=True)(points),
-    }
-    for name, work in works.items():
-        result, first = timed(work)
-        rest = statistics.median(timed(work)[1] for _ in range(3))
-        print(f"{name:10} first {first:7.2f} s, then {rest:7.3f} s", flush=True)
-    (_, fit), gradient = result
-    print(f"stationarity {float(fit.stats['stationarity']):.1e}, steps {int(fit.stats['num_steps'])}")
-    direction, step = rng.normal(size=points.shape), 1e-7 * float(fit.stats["diagonal"])
-    ends = [height(points + sign * step * direction, jf.ImplicitAdjoint())[0] for sign in (1, -1)]
-    difference = float(ends[0] - ends[1]) / (2 * step)
-    slope = float(np.sum(np.asarray(gradient) * direction))
-    print(f"along a random direction {slope:.9g}, central difference {difference:.9g}")
+    works = {"fit": lambda: fitted(points), "gradient": lambda: jax.grad(height)(jnp.asarray(points))}
+    done = in_turns(works, runs)
+    direction = np.random.default_rng(2).normal(size=points.shape)
+    # The derivative is that of the fit at rest, which an explicit adjoint returns.
+    ends = [float(height(points + s * 1e-6 * direction, jf.ImplicitAdjoint())) for s in (1, -1)]
+    slope, difference = float(jnp.sum(done["gradient"].result * direction)), (ends[0] - ends[1]) / 2e-6
+    report.row(
+        method=name,
+        points=len(points),
+        net="{}x{}".format(*base.shape),
+        **judged_surface(done["fit"].result.surface, points),
+        fit_s=done["fit"].median,
+        gradient_s=done["gradient"].median,
+        lowest_s=min(done["gradient"].later),
+        highest_s=max(done["gradient"].later),
+        in_fits=done["gradient"].median / done["fit"].median,
+        differences_in_fits=2 * points.size,
+        stationarity=float(fitted(points, jf.ImplicitAdjoint()).stats["stationarity"]),
+        agreement=abs(slope / difference - 1),
+    )
 
 
-if __name__ == "__main__":
-    main()
+def grids(report, options):
+    """Gradient of a height of an interpolating surface in all points of a grid."""
+    report.table("Gradients of fits of grids")
+    for n in (10,) if options.quick else (10, 40):
+        x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n + 2), indexing="ij")
+        grid = jnp.asarray(np.stack([x, y, 0.1 * np.sin(5 * x) * np.cos(4 * y)], axis=-1))
+        for name, method in GRID_METHODS.items():
+            _grid_row(report, grid, name, method, options.runs)
+
+
+def _grid_row(report, grid, name, method, runs):
+    def height(grid):
+        return jf.interpolate(grid, method).surface(0.3, 0.7)[2]
+
+    done = in_turns({"fit": lambda: height(grid), "gradient": lambda: jax.grad(height)(grid)}, runs)
+    report.row(
+        method=name,
+        points=grid.shape[0] * grid.shape[1],
+        **judged_surface(jf.interpolate(grid, method).surface, grid),
+        fit_s=done["fit"].median,
+        gradient_s=done["gradient"].median,
+        in_fits=done["gradient"].median / done["fit"].median,
+    )
+
+
+PARTS = {"fits": fits, "grids": grids}

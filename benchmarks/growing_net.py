@@ -1,6 +1,6 @@
 """`fit_points` without a net: the one it chooses for a tolerance, and what it makes of noise.
 
-    python benchmarks/growing_net.py [--data FOLDER] [--part tolerance noise] [name ...]
+    python -m benchmarks growing_net [--data FOLDER] [--part tolerance noise] [name ...]
 
 `tolerance`: net, errors in % of the diagonal, folds and seconds (a second call, which compiles nothing), and
 the same of nets tried one by one, about a quarter finer each time, until one meets the tolerance.

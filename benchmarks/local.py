@@ -1,9 +1,9 @@
 """Local mode: fit only where the error exceeds the tolerance, against fitting everywhere.
 
-    python benchmarks/local.py [--work FOLDER] [--data FOLDER] [--runs 3]
+    python -m benchmarks local [--data FOLDER] [--runs 3]
 
-On the stand-in `cl` in `--work` (files as for `approximation.py`) and on the terrain `jacksboro_dem` as a
-cloud. Prints iterations, points that pull, control points that have not changed in any bit, and times.
+On the terrain `jacksboro_dem` as a cloud. Prints iterations, points that pull, control points that have not
+changed in any bit, and times.
 """
 
 import argparse
@@ -22,13 +22,8 @@ import helpers
 import jaxfit as jf
 
 
-def problems(work, folder):
+def problems(folder):
     """Name, points, base, start, tolerance on the maximum error."""
-    if work is not None:
-        net, u, v = (np.load(work / f"cl_{part}.npy") for part in "PUV")
-        feet = np.load(work / "cl_uv0.npy")
-        base = jf.BSplineSurface(net, u, v)
-        yield "cl", np.load(work / "cl_pts.npy"), base, (feet[:, 0], feet[:, 1]), 3.2e-3
     with np.load(folder / "jacksboro_dem.npz") as arrays:
         grid = arrays["grid"]
     boundary = jf.Boundary(**helpers.grid_edges(grid))
@@ -40,13 +35,12 @@ def problems(work, folder):
 
 def main():
     parser = argparse.ArgumentParser(description="local mode against global fits")
-    parser.add_argument("--work", type=Path)
     parser.add_argument("--data", type=Path, default=helpers.FOLDER)
     parser.add_argument("--runs", type=int, default=3)
     options = parser.parse_args()
     heads = ("steps", "max %", "avg %", "pulling", "untouched", "s")
     print(("{:<16}{:<8}" + "{:>7}{:>9}{:>9}{:>20}{:>12}{:>8}").format("data", "mode", *heads))
-    for name, points, base, start, target in problems(options.work, options.data):
+    for name, points, base, start, target in problems(options.data):
         for mode, local in (("global", False), ("local", True)):
             method = jf.GeometricApproximation(local=local)
 

@@ -1,29 +1,16 @@
-"""Orthogonal distance beside the paper's two methods: passes, errors, time, ground truth and outliers.
+"""Orthogonal distance beside the paper's two methods: passes, errors, ground truth and outliers.
 
-    python benchmarks/orthogonal.py --work FOLDER --program ./oracle --data FOLDER [--part speed same ...]
+    python -m benchmarks orthogonal [--data FOLDER] [--part same limit truth robust]
 
-`--program` is a command-line program `gapprox surf= pts= uv= eavg= ins= fair= gamma=`, the geometric method.
-It reads models NAME_P.npy, NAME_U.npy, NAME_V.npy (control points and knots), NAME_pts.npy and NAME_uv0.npy
-(points and feet) from `--work` and prints a line of JSON with its time `cpu`, errors `avg` and `max`, net
-`n`, `m` and iterations `iters`; for `far` also the sides NAME_b0, b1, a0, a1 (v and u at 0 and 1). `--data`
-is the folder of the data sets that the tests use. Errors are in per cent of the diagonal, times medians after
-the first call; ours and theirs take turns.
+`--data` is the folder of the data sets that the tests use. Errors are in per cent of the diagonal.
 
-speed    to the target average from the same base: passes over the points and time
 same     same net and base: 10 passes beside 200 iterations of either method of the paper
 limit    the same, everything run until little moves: where the net and lambda set the limit, not the method
 truth    a B-spline surface from its points and knots, from a base 5 % off
 robust   1 % gross outliers and 0.02 % noise: errors against the clean points
-far      bases far from the points, where feet say little: errors and folds, from the base, from the same with
-         every span halved, and from bases made with the points
 """
 
 import argparse
-import functools
-import itertools
-import json
-import subprocess
-import time
 from pathlib import Path
 
 import jax
@@ -33,22 +20,17 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import jaxfit as jf
+from benchmarks._inputs import FOLDER
 
-TARGETS = {"mq": 6e-4, "cm": 2e-4}
-LAMBDAS = {"mq": 5e-6, "igea_face": 1e-6, "mountain": 5e-6, "mannequin_head": 5e-6}
+LAMBDAS = {"igea_face": 1e-6, "mountain": 5e-6, "mannequin_head": 5e-6}
 # Orthogonal distance bends less at the same lambda, so it may have a smaller one for the same energy; more
 # damping makes its first steps shorter and steadier.
-OTHERWISE = {"mq": {"damping": 0.1}, "igea_face": {"smoothing": 9e-7}, "mountain": {"smoothing": 4e-6}}
+OTHERWISE = {"igea_face": {"smoothing": 9e-7}, "mountain": {"smoothing": 4e-6}}
 LIMITED = ("igea_face", "mountain")
 
 
 def model(options, name):
-    """Points, base surface, and feet on it if they are known."""
-    if (options.work / f"{name}_P.npy").is_file():
-        net, u, v, points, feet = (
-            np.load(options.work / f"{name}_{x}.npy") for x in ("P", "U", "V", "pts", "uv0")
-        )
-        return points, jf.BSplineSurface(net, u, v), (feet[:, 0], feet[:, 1])
+    """Points, base surface, and None: no feet are known."""
     points, boundary = cloud(options, name)
     return points, jf.base_surface(boundary, points, net=(42, 42), method=jf.Meshless()), None
 
@@ -59,12 +41,6 @@ def cloud(options, name):
         return arrays["points"], jf.Boundary(*sides)
 
 
-def timed(work):
-    begun = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - begun
-
-
 def row(*cells):
     """Print cells in columns: a pair is a cell and its width."""
     print("".join(f"{text!s:<{width}}" for text, width in cells), flush=True)
@@ -73,43 +49,6 @@ def row(*cells):
 def columns(fit):
     """Errors of a fit, in per cent."""
     return (f"{100 * float(x):.4f}" for x in (fit.average_error, fit.maximum_error))
-
-
-def speed(options):
-    widths = (7, 20, 8, 10, 10, 8, 10, 8)
-    heads = ("model", "method", "passes", "avg %", "max %", "net", "seconds", "theirs/ours")
-    row(*zip(heads, widths, strict=True))
-    for name, target in TARGETS.items():
-        points, base, start = model(options, name)
-
-        def ours(points=points, base=base, start=start, target=target):
-            method = jf.OrthogonalDistance()
-            return jf.approximate(points, base, method, tol_average=target, max_steps=20, start=start)
-
-        ours()
-        spent, other = [], []
-        for _ in range(options.turns):
-            fit, seconds = timed(ours)
-            spent.append(seconds)
-            report = theirs(options, name, target)
-            other.append(report["cpu"])
-        net = "x".join(str(x) for x in fit.surface.shape)
-        passes = len(fit.history.average)  # every surface that was measured, the base included
-        seconds = (np.median(spent), np.median(other))
-        cells = (name, "OrthogonalDistance", passes, *columns(fit), net, f"{seconds[0]:.3f}")
-        row(*zip((*cells, f"{seconds[1] / seconds[0]:.2f}"), widths, strict=True))
-        net, errors = f"{report['n']}x{report['m']}", (f"{100 * report[x]:.4f}" for x in ("avg", "max"))
-        cells = (name, "program", report["iters"] + 1, *errors, net, f"{seconds[1]:.3f}", "")
-        row(*zip(cells, widths, strict=True))
-
-
-def theirs(options, name, target):
-    files = {"surf": name, "pts": f"{name}_pts.npy", "uv": f"{name}_uv0.npy"}
-    settings = {"eavg": target, "ins": 40, "fair": 20, "gamma": 2}
-    words = [f"{key}={options.work / value}" for key, value in files.items()]
-    words += [f"{key}={value}" for key, value in settings.items()]
-    printed = subprocess.run([options.program, "gapprox", *words], check=True, capture_output=True, text=True)
-    return json.loads(printed.stdout.strip().splitlines()[-1])
 
 
 def same(options):
@@ -209,53 +148,13 @@ def robust(options):
                 row(*zip(cells, widths, strict=True))
 
 
-def far(options):
-    widths = (6, 10, 7, 24, 7, 10, 10, 22, 8)
-    heads = ("model", "base", "net", "method", "steps", "avg %", "max %", "folded % (base's)", "result")
-    row(*zip(heads, widths, strict=True))
-    kinds = (jf.GeometricApproximation, jf.StandardApproximation, jf.OrthogonalDistance)
-    for name in ("gc", "gh"):
-        for (title, points, base, start), kind in itertools.product(bases(options, name), kinds):
-            fit = jf.approximate(points, base, kind(), tol_average=6e-4, max_steps=300, start=start)
-            folds = f"{100 * folded(fit.surface):.3f} ({100 * folded(base):.3f})"
-            net = "x".join(str(x) for x in fit.surface.shape)
-            cells = (title, net, kind.__name__, int(fit.stats["num_steps"]), *columns(fit), folds)
-            row(*zip((name, *cells, fit.message[:30]), widths, strict=True))
-
-
-def bases(options, name):
-    """The far base, the same with spans halved, and two made with the points on as many control points."""
-    points, base, start = model(options, name)
-    boundary = jf.Boundary(*(np.load(options.work / f"{name}_{x}.npy") for x in ("b0", "b1", "a0", "a1")))
-    breaks = (np.unique(k) for k in (base.knots_u, base.knots_v))
-    middles = ((x[1:] + x[:-1]) / 2 for x in breaks)
-    on_points = functools.partial(jf.base_surface, boundary, points, base.shape)
-    return [
-        ("far", points, base, start),
-        ("halved", points, base.insert_knots(*middles), start),
-        ("dynamic", points, on_points(method=jf.DynamicBaseSurface()), None),
-        ("meshless", points, on_points(method=jf.Meshless()), None),
-    ]
-
-
-def folded(surface):
-    """Share of neighbours on a fine grid whose normals are more than a right angle apart."""
-    u, v = (np.linspace(k[0], k[-1], 401) for k in (surface.knots_u, surface.knots_v))
-    n = np.asarray(surface.normal(*np.meshgrid(u, v, indexing="ij")))
-    cosines = [np.sum(n[1:] * n[:-1], -1), np.sum(n[:, 1:] * n[:, :-1], -1)]
-    return float(np.mean(np.concatenate([x.ravel() for x in cosines]) < 0))
-
-
-PARTS = {"speed": speed, "same": same, "limit": limit, "truth": truth, "robust": robust, "far": far}
+PARTS = {"same": same, "limit": limit, "truth": truth, "robust": robust}
 
 
 def main():
     parser = argparse.ArgumentParser(description="orthogonal distance beside the paper's methods")
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--program", required=True)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=FOLDER)
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--turns", type=int, default=5)
     options = parser.parse_args()
     print(f"jax {jax.__version__}, {jax.default_backend()}, float64")
     for part in options.part:

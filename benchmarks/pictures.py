@@ -1,6 +1,6 @@
 """Base surface, default fit and the paper's fit of each scan, side by side: shading, zebra stripes, folds.
 
-    python benchmarks/pictures.py [--target 1e-6] [--max-steps 200] [--folder .] [--data FOLDER] [name ...]
+    python -m benchmarks pictures [--target 1e-6] [--max-steps 200] [--folder .] [--data FOLDER] [name ...]
 
 The target may be out of reach, so that one sees what a method does to a surface that cannot be as close as
 asked. Folds are red in the pictures `<name>.png`. The table counts them, with the smallest angle between

@@ -1,6 +1,6 @@
 """Automatic lambda beside the best one: standard fits of noisy clouds, judged by the points without noise.
 
-    python benchmarks/smoothing.py [--data FOLDER] [--noise 3e-3] [name ...]
+    python -m benchmarks smoothing [--data FOLDER] [--noise 3e-3] [name ...]
 
 Noise is normal, its length a fraction of the diagonal on average. For every lambda: the mean distance of the
 points without noise from the surface fitted to those with, in % of the diagonal. Then what

@@ -1,15 +1,23 @@
-"""The programs in `benchmarks/` use public names only, and each says what it takes."""
+"""`python -m benchmarks` uses public names only, says what it runs, and writes what it measured."""
 
 import ast
+import json
 import subprocess
 import sys
 
-from helpers import CHECKOUT
+import numpy as np
+import pytest
+from helpers import CHECKOUT, wavy_cloud, wavy_surface
 
-import jaxfit
+import jaxfit as jf
+
+sys.path.insert(0, str(CHECKOUT))
+
+from benchmarks import __main__ as program
+from benchmarks import _inputs, _referee, _report, _timing
 
 FOLDER = CHECKOUT / "benchmarks"
-PROGRAMS = sorted(FOLDER.glob("*.py"))
+FILES = sorted(FOLDER.glob("*.py"))
 
 
 def private(name):
@@ -35,39 +43,78 @@ def names_of_jaxfit(tree):
 
 
 def test_benchmarks_take_public_names_only():
-    for path in PROGRAMS:
+    for path in FILES:
         names = set(names_of_jaxfit(ast.parse(path.read_text())))
-        assert names, path
         assert not [name for name in names if private(name)], path
-        missing = [name for name in names if name and not hasattr(jaxfit, name.split(".")[0])]
+        missing = [name for name in names if name and not hasattr(jf, name.split(".")[0])]
         assert not missing, f"{path}: these are no public names of jaxfit"
 
 
-def test_benchmarks_are_programs_with_a_docstring_and_a_main():
-    for path in PROGRAMS:
-        tree = ast.parse(path.read_text())
-        assert f"python benchmarks/{path.name}" in ast.get_docstring(tree)
-        assert "main" in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)], path
-        guard = tree.body[-1]
-        assert isinstance(guard, ast.If), path
-        assert ast.unparse(guard.test) == "__name__ == '__main__'"
+def test_every_file_is_a_suite_a_study_or_a_part_of_one():
+    names = {path.stem for path in FILES if not path.stem.startswith("_")}
+    parts = {"paper_grids", "paper_clouds"}
+    assert names == set(program.SUITES) | set(program.STUDIES) | parts
 
 
-def test_every_benchmark_explains_its_options():
+def test_suites_and_studies_explain_themselves():
     # One process imports JAX once for all of them.
-    program = """
-import runpy, sys
-sys.path.insert(0, sys.argv[1])
-for path in sys.argv[2:]:
-    sys.argv = [path, "--help"]
+    script = """
+import importlib, sys
+from benchmarks.__main__ import main
+suites, *names = sys.argv[1:]  # a study gets a sys.argv of its own
+for name in names:
     try:
-        runpy.run_path(path, run_name="__main__")
+        main([name, "--help"])
     except SystemExit as end:
-        assert end.code == 0, path
+        assert end.code == 0, name
     else:
-        raise AssertionError(path + " has no --help")
+        raise AssertionError(name + " has no --help")
+for name in suites.split():
+    module = importlib.import_module("benchmarks." + name)
+    assert module.__doc__ and all(part.__doc__ for part in module.PARTS.values()), name
 """
-    command = [sys.executable, "-c", program, str(FOLDER), *map(str, PROGRAMS)]
+    command = [sys.executable, "-c", script, " ".join(program.SUITES), "paper", *program.STUDIES]
     done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("usage:") == len(PROGRAMS)
+    assert done.stdout.count("usage:") == len(program.STUDIES) + 1
+
+
+def test_an_unknown_suite_or_part_is_a_sentence(capsys):
+    with pytest.raises(SystemExit):
+        program.main(["papers"])
+    assert "'papers' is no suite" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="--only table9: there is no such part"):
+        program.main(["paper", "--only", "table9"])
+
+
+def test_the_referee_finds_true_distances_and_folds():
+    surface = wavy_surface()
+    points = wavy_cloud(300)[0]
+    away = _referee.distances(surface.control_points, (surface.knots_u, surface.knots_v), points)
+    np.testing.assert_allclose(away, jf.closest_point(surface, points).distance, atol=1e-8)
+    assert _referee.folds(surface.control_points, (surface.knots_u, surface.knots_v)) == 0
+    net = np.array(surface.control_points)
+    net[2, :, 0] = 0.9  # a row that goes ahead and back
+    assert _referee.folds(net, (surface.knots_u, surface.knots_v)) > 0
+
+
+def test_stand_ins_are_finite_and_have_the_sizes_of_the_paper():
+    assert [x.points.shape for x in _inputs.grids(True)] == [(10, 10, 3), (50, 200, 3), (100, 400, 3)]
+    clouds = list(_inputs.clouds(True))
+    assert [len(x.points) for x in clouds] == [3_000, 11_469, 138_632]
+    assert all(np.isfinite(x.points).all() for x in clouds)
+
+
+def test_a_report_is_written_with_the_machine(tmp_path):
+    report = _report.Report(quiet=True)
+    report.table("A title", "A note.")
+    found = _timing.timed(lambda: 1, 3)
+    report.row(method="one", **found.cells())
+    report.row(method="two", share=float("nan"))
+    report.write(tmp_path / "r.json", tmp_path / "r.md")
+    read = json.loads((tmp_path / "r.json").read_text())
+    assert read["machine"]["cores"] >= 1
+    assert read["tables"][0]["rows"][0]["lowest s"] <= read["tables"][0]["rows"][0]["median s"]
+    page = (tmp_path / "r.md").read_text()
+    assert "## A title" in page
+    assert "| two |" in page

@@ -1,15 +1,11 @@
 """Seconds of the first and of a later call, each in a process of its own that has no compilation cache.
 
-    python benchmarks/first_call.py [--other PATH] [--runs 3] [--calls CALL ...]
-
 The calls are `closest_point`, `interpolate` and `approximate` with each method, on a made cloud of 3,000
 points, a 16 x 14 net and a grid of 20 x 24 points. The first call compiles; the later one is the median of
-three in the same process. `--other` is a second checkout of jaxfit, put first on the path: both then take
-turns, so that they meet the same machine. Printed are medians over the runs with the lowest and the highest,
-and, of the other checkout, the seconds of its first call beyond those of a later one, as a multiple of ours.
+three in the same process. The environment variable JAXFIT_OTHER may name a second checkout of jaxfit: both
+then take turns, to meet the same machine.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -91,57 +87,44 @@ def measured(name):
 
 
 def in_new_process(name, checkout):
-    """`measured` with the jaxfit of `checkout`: seconds of the first call and of a later one."""
+    """`measured` with the jaxfit of `checkout`."""
     environment = {key: x for key, x in os.environ.items() if key != "JAX_COMPILATION_CACHE_DIR"}
-    environment |= {"JAX_ENABLE_COMPILATION_CACHE": "false", "PYTHONPATH": paths(checkout)}
-    command = [sys.executable, str(Path(__file__).resolve()), "--measure", name]
+    path = os.pathsep.join(filter(None, [str(checkout), os.environ.get("PYTHONPATH")]))
+    environment |= {"JAX_ENABLE_COMPILATION_CACHE": "false", "PYTHONPATH": path}
+    command = [sys.executable, str(Path(__file__).resolve()), name]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{name} fails with {checkout}:\n{done.stderr}")
-    report = json.loads(done.stdout.splitlines()[-1])
-    if not Path(report["file"]).is_relative_to(checkout):
-        sys.exit(f"{checkout} has no jaxfit: {report['file']} was imported")
-    return report["first"], report["later"]
+    found = json.loads(done.stdout.splitlines()[-1])
+    if not Path(found["file"]).is_relative_to(checkout):
+        sys.exit(f"{checkout} has no jaxfit: {found['file']} was imported")
+    return found["first"], found["later"]
 
 
-def paths(checkout):
-    """The checkout, then what the path holds already."""
-    return os.pathsep.join(filter(None, [str(checkout), os.environ.get("PYTHONPATH")]))
-
-
-def cells(times):
-    """First and later call as text: median, lowest and highest."""
-    parts = [f"{np.median(x):8.3f} [{np.min(x):.3f}, {np.max(x):.3f}]" for x in np.transpose(times)]
-    return "".join(f"{part:<27}" for part in parts)
-
-
-def main():
-    """Print a line for each call and checkout."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--other", type=Path, help="a second checkout of jaxfit, for instance an older one")
-    parser.add_argument("--runs", type=int, default=3, help="processes for each call and checkout")
-    parser.add_argument("--calls", nargs="*", default=list(CALLS), choices=CALLS, metavar="CALL")
-    parser.add_argument("--measure", choices=CALLS, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.measure:
-        print(json.dumps(measured(options.measure)))
-        return
-    checkouts = {"this": HERE} | ({"other": options.other.resolve()} if options.other else {})
-    print(f"{'':<24}{'':<7}{'first call, s':<27}{'later call, s':<27}")
-    for name in options.calls:
+def calls(report, options):
+    """First and later calls of the public entries."""
+    report.table("First calls", "Seconds; medians over the processes, the first call with its spread.")
+    checkouts = {"this": HERE}
+    if os.environ.get("JAXFIT_OTHER"):
+        checkouts["other"] = Path(os.environ["JAXFIT_OTHER"]).resolve()
+    for name in list(CALLS)[: 1 if options.quick else None]:
         times = {key: [] for key in checkouts}
-        for _ in range(options.runs):
+        for _ in range(min(options.runs, 3)):
             for key, checkout in checkouts.items():
                 times[key].append(in_new_process(name, checkout))
-        beyond = {key: np.median(-np.diff(x)) for key, x in times.items()}
-        for key, x in times.items():
-            note = (
-                f"{beyond[key] / beyond['this']:.2f} times our seconds beyond a later call"
-                if key == "other"
-                else ""
+        for key, found in times.items():
+            first, later = np.transpose(found)
+            report.row(
+                call=name,
+                checkout=key,
+                first_s=float(np.median(first)),
+                lowest_s=float(first.min()),
+                highest_s=float(first.max()),
+                later_s=float(np.median(later)),
             )
-            print(f"{name:<24}{key:<7}{cells(x)}{note}", flush=True)
 
+
+PARTS = {"calls": calls}
 
 if __name__ == "__main__":
-    main()
+    print(json.dumps(measured(sys.argv[1])))
