@@ -29,7 +29,10 @@ def fits(report, options):
         points = points + 0.003 * np.random.default_rng(1).normal(size=points.shape)
         base = jf.base_surface(boundary, net=(net, net))
         for name, method in METHODS.items():
-            _row(report, points, base, name, method, options.runs)
+            try:
+                _row(report, points, base, name, method, options.runs)
+            except ArithmeticError as refusal:
+                report.remark(f"{name}, {count} points, {net}x{net}: {refusal}")
 
 
 def _row(report, points, base, name, method, runs):
