@@ -31,6 +31,7 @@ STUDIES = {
     "closest_point": "closest points: time a point, and how many are wrong",
     "growing_net": "the net chosen for a tolerance, and noise",
     "local": "local mode",
+    "streams": "clouds in files, larger than memory",
     "orthogonal": "orthogonal distance: passes, errors, outliers",
     "pictures": "base, default and paper side by side",
     "smoothing": "automatic choices of lambda",

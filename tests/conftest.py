@@ -3,11 +3,14 @@
 `--float32` is the second pass: x64 off, and only the tests marked `float32_too`.
 """
 
+import itertools
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
+import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
@@ -53,3 +56,18 @@ def pytest_collection_modifyitems(config, items):
     kept = [item for item in items if item.get_closest_marker("float32_too")]
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = kept
+
+
+# Linux gives a process 65,530 memory mappings, and every compiled kernel takes some: without this a worker
+# would be ended by the system somewhere in the second half of the session.
+MOST_MAPPINGS, LOOK_EVERY = 35_000, 5  # tests
+COUNT = itertools.count(1)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item, nextitem):
+    maps = Path("/proc/self/maps")
+    if next(COUNT) % LOOK_EVERY or not maps.exists():
+        return
+    if maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()

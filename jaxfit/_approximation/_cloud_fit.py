@@ -120,8 +120,9 @@ def _differentiable(
     )
     adjoint = request["adjoint"]
     if adjoint is None:
-        net = jnp.asarray(end.surface.control_points, dtype)
-        net = jnp.asarray(end.unit.outward(net), dtype)
+        net = jnp.asarray(end.unit.outward(jnp.asarray(end.surface.control_points, dtype)), dtype)
+        nu, nv = surface.shape
+        net = net.at[:nu, :nv].set(surface.control_points.astype(dtype))  # to the last bit
         unknown = jnp.asarray(jnp.nan, dtype)
         u, v, error = (jnp.asarray(x) for x in known[:3])
         diagonal = jnp.asarray(end.unit.diagonal, dtype)

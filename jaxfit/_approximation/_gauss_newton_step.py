@@ -18,7 +18,7 @@ from jaxfit._normal_equations import (
 )
 
 RESIDUAL = 1e-6  # of a step's linear system, where conjugate gradients stop, if MOST_STEPS do not end them
-MOST_STEPS = 40  # of conjugate gradients: as a rule all of them, so that rounding does not decide the number
+MOST_STEPS = 60  # of conjugate gradients: as a rule all of them, so that rounding does not decide the number
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 

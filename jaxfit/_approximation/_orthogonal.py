@@ -236,7 +236,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order)
         # A step that folds is taken again with more smoothing there, not with more damping everywhere.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
-        following = next_damping(damped, objective, gain, better, usual)
+        following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
         following = jnp.where(better & ~good, damped.damping, following)
         following = jnp.where(new.step == 1, self.damping, following)
         kept = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
