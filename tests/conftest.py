@@ -66,7 +66,7 @@ MOST_MAPPINGS = 25_000
 def pytest_runtest_teardown(item, nextitem):
     # Tests of one file may count on what the file has compiled.
     maps = Path("/proc/self/maps")
-    if nextitem is not None and nextitem.path == item.path or not maps.exists():
+    if (nextitem is not None and nextitem.path == item.path) or not maps.exists():
         return
     if maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
         jax.clear_caches()
