@@ -47,6 +47,7 @@ def fit_scan(
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
         fit = fit_cloud(cloud, nets.base(net), method, request | {"start": nets.feet(net)})
+    fit = dataclasses.replace(fit, stats=fit.stats | {"counted": weights > 0})
     return _with_loops(_for_all(fit, finite), sheet, sheet.layout(net, order))
 
 

@@ -90,10 +90,13 @@ class Fit(eqx.Module):
 
     @property
     def inside(self) -> Bool[Array, "..."]:
-        """Which points have their foot inside the loops of `trimmed`: all, where there are none."""
+        """Which points have their foot inside the loops of `trimmed`: all, where there are none.
+
+        Points that were left out as no part of the sheet are not inside.
+        """
         if self.trimmed is None:
             return jnp.ones(jnp.shape(self.errors), bool)
-        return self.trimmed.contains(self.u, self.v)
+        return self.trimmed.contains(self.u, self.v) & jnp.asarray(self.stats.get("counted", True))
 
     @cached_property
     def regularity(self) -> Regularity:
