@@ -63,7 +63,7 @@ def fit_points(
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer. Only with a boundary.
-    faces : array of int (faces, 3), optional
+    faces : array (faces, 3) of int, optional
         The triangles of the file that the points come from, as numbers of points. Only without a boundary.
         Default: the points are connected by their neighbours.
     hole_length : float, optional

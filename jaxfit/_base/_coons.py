@@ -24,6 +24,7 @@ class Greville(AbstractAbscissae):
     r"""Greville abscissae: the blend of four straight sides is their bilinear patch, always.
 
     $s_i = (t_{i+1} + \dots + t_{i+K-1}) / (K - 1)$, mapped to [0, 1]. The default of `coons_surface`.
+    Source: C. de Boor, A Practical Guide to Splines, revised edition (2001), chapter IX.
 
     Examples
     --------

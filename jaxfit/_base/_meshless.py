@@ -61,6 +61,9 @@ class Meshless(AbstractBaseMethod):
     and scale. Takes 1 s for 6,000 points and 5 s for 25,000 on one core, several times as long where noise is
     coarser than the points are dense.
 
+    Source: M. S. Floater and M. Reimers, Computer-Aided Geometric Design 18 (2001), for the parameters; the
+    smoothed surface and its loss of weights are this library's own.
+
     Raises
     ------
     ValueError
