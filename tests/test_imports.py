@@ -13,7 +13,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 ROOMS = [
     ("_interrupt",),
     ("_checks",),
-    ("_precision",),
+    ("_precision", "_progress_line"),
     ("_barrier", "_compile"),
     ("_splines",),
     ("_parameters",),
