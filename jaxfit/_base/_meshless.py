@@ -20,8 +20,8 @@ class Meshless(AbstractBaseMethod):
 
     The control points inside minimise
 
-    .. math:: \sum_k w_k |R(u_k, v_k) - Q_k|^2
-              + \lambda \int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2 \, du\, dv ,
+    $$\sum_k w_k |R(u_k, v_k) - Q_k|^2
+      + \lambda \int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2 \, du\, dv ,$$
 
     those of the border stay with the boundary curves. Along the sides, parameters by chord length are taken
     over to the parameters of these curves. Parameters come from neighbours, not from a projection, so

@@ -35,7 +35,7 @@ def curve_parameters(
 ) -> Float[Array, " points"]:
     r"""Parameters of a row of points on [0, 1], strictly increasing.
 
-    .. math:: u_0 = 0, \qquad u_i = u_{i-1} + |Q_i - Q_{i-1}|^a / \sum_k |Q_k - Q_{k-1}|^a,
+    $$u_0 = 0, \qquad u_i = u_{i-1} + |Q_i - Q_{i-1}|^a / \sum_k |Q_k - Q_{k-1}|^a,$$
 
     with `a = method.exponent`. A step shorter than eps^(1/3) of the mean step (6e-6 in float64,
     5e-3 in float32), such as that between two equal neighbours, is lengthened to that and the
