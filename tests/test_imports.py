@@ -87,6 +87,14 @@ def test_rooms_import_only_lower_rooms():
     assert not wrong
 
 
+def test_the_page_for_contributors_lists_all_rooms():
+    page = (CHECKOUT / ".docs" / "pages" / "contributing.md").read_text()
+    table = page.split("## Rooms")[1].split("## ")[0]
+    listed = [name.removesuffix("/").removesuffix(".py") for name in re.findall(r"^\| `(\S+)`", table, re.M)]
+    rooms = [room for rooms in ROOMS for room in rooms if not room.startswith("_cli_")]
+    assert listed == [room.replace("_cli", "_cli*") for room in rooms]
+
+
 def test_no_room_changes_the_global_configuration():
     changes = re.compile(r"config\.update|config\.\w+ = |enable_x64\(")
     changed = [
