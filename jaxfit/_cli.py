@@ -57,7 +57,7 @@ def _run(argv: Sequence[str] | None) -> int:
             return _fit_command(args, started)
     except KeyboardInterrupt:
         return _fail("interrupted, nothing more is written.", INTERRUPTED)
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:  # an extra may be missing
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
         return _fail(f"the fit failed: {error or type(error).__name__}", FAILED)
