@@ -16,7 +16,7 @@ from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_page import write_page
 from jaxfit._cli_report import print_table, progress_bar
-from jaxfit._cli_session import choose_precision, set_compile_cache
+from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line
 from jaxfit._fit._summary import facts
 
 REACHED, NOT_REACHED, BAD_INPUT, FAILED = 0, 1, 2, 3
@@ -47,6 +47,7 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         _interrupt.restore_ctrl_c()
         args = argument_parser().parse_args(argv)
+        show_no_line()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             if args.command == "batch":
@@ -56,7 +57,7 @@ def _run(argv: Sequence[str] | None) -> int:
             return _fit_command(args, started)
     except KeyboardInterrupt:
         return _fail("interrupted, nothing more is written.", INTERRUPTED)
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:  # an extra may be missing
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
         return _fail(f"the fit failed: {error or type(error).__name__}", FAILED)

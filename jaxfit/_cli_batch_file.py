@@ -69,7 +69,7 @@ def fit_file(job: Job) -> Row:
             _set_compile_cache_once(*(job.arguments[key] for key in _SETTINGS))
             choose_precision(args)
             return job.row | _fitted(args)
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, ImportError) as error:  # an extra may be missing
         return failed(job, error)
     except Exception as error:  # whatever it is, the other files go on
         return failed(job, f"the fit failed: {error or type(error).__name__}")

@@ -7,11 +7,17 @@ import sys
 import jax
 
 from jaxfit._cli_cache import VARIABLE, cache_folder
+from jaxfit._progress_line import SETTING
 
 
 def choose_precision(args: argparse.Namespace) -> None:
     """Double, unless told ``--float32``."""
     jax.config.update("jax_enable_x64", not args.float32)
+
+
+def show_no_line() -> None:
+    """Have fits, those of worker processes too, show no line of their own beside the command's bar."""
+    os.environ[SETTING] = "off"
 
 
 def set_compile_cache(args: argparse.Namespace) -> None:

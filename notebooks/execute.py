@@ -6,6 +6,7 @@ With --write the outputs are kept in the files.
 """
 
 import argparse
+import os
 import subprocess
 import sys
 import time
@@ -41,6 +42,7 @@ def main():
     parser.add_argument("notebooks", nargs="*", type=Path)
     parser.add_argument("--write", action="store_true", help="keep the outputs")
     options = parser.parse_args()
+    os.environ["JAXFIT_PROGRESS"] = "off"  # no line in the stored outputs
     if not options.notebooks:
         execute_readme()
     for path in options.notebooks or sorted(HERE.glob("*.ipynb")):

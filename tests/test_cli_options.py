@@ -231,6 +231,13 @@ def test_a_tolerance_that_was_missed_is_told(fits, folder, argv, code):
     assert (folder / "s.npz").is_file()
 
 
+def test_a_missing_extra_is_a_sentence(fits, folder, capsys):
+    fits.fails = ImportError('points without a boundary need shapely; pip install "jaxfit-surfaces[scan]".')
+    assert _cli.main(["fit", "cloud.npz", "-o", "out.npz"]) == 2
+    assert capsys.readouterr().err == f"jaxfit: error: {fits.fails}\n"
+    assert not (folder / "out.npz").exists()
+
+
 @pytest.mark.parametrize("how", ["nan", "raise"])
 def test_a_numerical_failure_writes_nothing(fits, folder, capsys, how):
     before = names(folder)

@@ -7,15 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_docstrings import public_names
 
 import jaxfit as jf
-import jaxfit.io
 
-PUBLIC = {
-    name: value
-    for name, value in vars(jf).items()
-    if not name.startswith("_") and not inspect.ismodule(value) and getattr(value, "__module__", None)
-}
+PUBLIC = dict(public_names())
 ROOMS = sorted({value.__module__.split(".")[1] for value in PUBLIC.values()})
 
 
@@ -45,11 +41,3 @@ def test_examples_are_true(room):
             doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
             assert not report, "".join(report)
     assert not without
-
-
-@pytest.mark.parametrize("name", ["read_points", "write_surface"])
-def test_examples_of_files_are_true(name):
-    (test,) = examples(name, getattr(jf.io, name))
-    report = []
-    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
-    assert not report, "".join(report)

@@ -13,7 +13,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 ROOMS = [
     ("_interrupt",),
     ("_checks",),
-    ("_precision",),
+    ("_precision", "_progress_line"),
     ("_barrier", "_compile"),
     ("_splines",),
     ("_parameters",),
@@ -85,6 +85,14 @@ def test_rooms_import_only_lower_rooms():
         assert room in HEIGHT, f"{path} is in no room; add it to ROOMS"
         wrong += filter(None, (complaint(path, room, other) for other in imported_rooms(path)))
     assert not wrong
+
+
+def test_the_page_for_contributors_lists_all_rooms():
+    page = (CHECKOUT / ".docs" / "pages" / "contributing.md").read_text()
+    table = page.split("## Rooms")[1].split("## ")[0]
+    listed = [name.removesuffix("/").removesuffix(".py") for name in re.findall(r"^\| `(\S+)`", table, re.M)]
+    rooms = [room for rooms in ROOMS for room in rooms if not room.startswith("_cli_")]
+    assert listed == [room.replace("_cli", "_cli*") for room in rooms]
 
 
 def test_no_room_changes_the_global_configuration():

@@ -150,3 +150,5 @@ def test_names_and_sizes_get_a_sentence():
         jf.pad_clouds(CLOUDS, CLOUDS)
     with pytest.raises(ValueError, match="see pad_clouds"):
         jax.jit(lambda cloud: jf.map_fits([cloud, CLOUDS[1]], BASE)[0].average_error)(CLOUDS[0])
+    with pytest.raises(ValueError, match="workers must be a whole number of at least 1, but is 0"):
+        jf.worker_processes(0).__enter__()

@@ -12,9 +12,11 @@ from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._loop import Progress
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
+from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineSurface
 
 
+@shows_progress("fitting a cloud")
 @eager_where_concrete
 def approximate(
     points: ArrayLike,
@@ -55,6 +57,8 @@ def approximate(
         Feet (u, v) on the base surface to start from; default the closest points, searched globally.
     progress : callable, optional
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+        Without it a line in the terminal (which takes rich) or the notebook says what is done, once that
+        takes more than 3 s; ``off`` in the environment variable `JAXFIT_PROGRESS` shows none.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
     errors : GlobalFeet(), LocalFeet() or AtParameters(), optional

@@ -30,6 +30,7 @@ from jaxfit._fit._result import Fit, Name, converged_or_raise
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import advise_x64, working_dtype
+from jaxfit._progress_line import doing
 from jaxfit._splines import BSplineSurface
 
 LEAST_POINTS = 4
@@ -65,6 +66,8 @@ def fit_cloud(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
+    nu, nv = base.shape
+    doing(f"fitting {nu} x {nv} control points to {cloud.shape[0]:,} points")
     loop = begin(method, together, begun, u[order], v[order], max_steps)
     loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = fitted_surface(loop, base, begun, unit)

@@ -30,8 +30,11 @@ class WeightedErrors(eqx.Module):
 class ControlPointSums(PointSums):
     """The sums `WeightedErrors` over all points, accumulated while feet are updated.
 
-    `weigh(weight, error)` gives the weights that count, from those of the points and the lengths of their
-    residuals; without it the weights of the points count.
+    Parameters
+    ----------
+    weigh : function, optional
+        `weigh(weight, error)` gives the weights that count, from those of the points and the lengths of their
+        residuals, arrays of any shape. By default the weights of the points count.
 
     Notes
     -----

@@ -26,8 +26,10 @@ from jaxfit._base import (
 from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
+from jaxfit._progress_line import doing, shows_progress
 
 
+@shows_progress("fitting a cloud")
 @eager_where_concrete
 def fit_points(
     points: Any,
@@ -63,7 +65,7 @@ def fit_points(
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer. Only with a boundary.
-    faces : array of int (faces, 3), optional
+    faces : array (faces, 3) of int, optional
         The triangles of the file that the points come from, as numbers of points. Only without a boundary.
         Default: the points are connected by their neighbours.
     hole_length : float, optional
@@ -175,6 +177,7 @@ def _parts(data: Any, boundary: Any, faces: Any) -> tuple[Any, Any, Any]:
 
 def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int, int], base: Any) -> Any:
     if base is None and is_concrete(cloud):
+        doing("making a base surface")
         return default_base(boundary, np.asarray(cloud), net, order)
     return base_surface(boundary, cloud, net=net, order=order, method=base)
 

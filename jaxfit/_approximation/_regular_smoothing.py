@@ -78,6 +78,9 @@ class RegularSmoothing(eqx.Module):
     four thin plates. Where a surface is far smoother than its net it was 1.7 times that: there a coarser net
     or a greater `least` is better. `first` matters: the large shape has to settle before detail is followed.
 
+    Source: this library's own. The thin plate that it departs from is equation (10) of Kineri, Wang, Lin and
+    Maekawa (2012).
+
     Examples
     --------
     >>> jf.OrthogonalDistance(smoothing=jf.RegularSmoothing(least=1.0)).smoothing.least

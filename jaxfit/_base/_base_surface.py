@@ -13,6 +13,7 @@ from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
 from jaxfit._base._same_place import check_same_place
 from jaxfit._checks import as_points, check_kind, check_number, check_order, eager_where_concrete, is_concrete
+from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineSurface
 
 MAX_STEPS = 100  # of the curve fit; few curves use them up
@@ -20,6 +21,7 @@ CLOSE = 0.01  # the curve fit stops when its average error is this much of the t
 FLAT = 0.2  # with a given net, pieces this straight (times the tolerance) are split in the middle
 
 
+@shows_progress("making a base surface")
 @eager_where_concrete
 def base_surface(
     boundary: Boundary,

@@ -24,6 +24,7 @@ class Greville(AbstractAbscissae):
     r"""Greville abscissae: the blend of four straight sides is their bilinear patch, always.
 
     $s_i = (t_{i+1} + \dots + t_{i+K-1}) / (K - 1)$, mapped to [0, 1]. The default of `coons_surface`.
+    Source: C. de Boor, A Practical Guide to Splines, revised edition (2001), chapter IX.
 
     Examples
     --------
@@ -68,8 +69,8 @@ def coons_surface(
     The control points of the curves are blended (paper, equations (6)-(7)). With abscissae
     $s_i, t_j$ and corner points $P_{00}, P_{n0}, P_{0m}, P_{nm}$
 
-    .. math:: P_{ij} = (1-s_i) P_{0j} + s_i P_{nj} + (1-t_j) P_{i0} + t_j P_{im}
-              - [(1-s_i)(1-t_j) P_{00} + (1-s_i) t_j P_{0m} + s_i (1-t_j) P_{n0} + s_i t_j P_{nm}].
+    $$P_{ij} = (1-s_i) P_{0j} + s_i P_{nj} + (1-t_j) P_{i0} + t_j P_{im}
+      - [(1-s_i)(1-t_j) P_{00} + (1-s_i) t_j P_{0m} + s_i (1-t_j) P_{n0} + s_i t_j P_{nm}].$$
 
     The surface has the four curves as its sides where they share their corners; where they do not
     quite, `v0` and `v1` win. Works under `jit`, `vmap` and `grad`.

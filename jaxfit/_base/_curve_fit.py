@@ -61,7 +61,7 @@ def fit_curves(
 
     Each step projects the points onto the curve and moves every control point but the ends by
 
-    .. math:: P_i \mathrel{+}= \sum_k N_i(u_k) e_k / \sum_k N_i(u_k), \qquad e_k = Q_k - C(u_k)
+    $$P_i \mathrel{+}= \sum_k N_i(u_k) e_k / \sum_k N_i(u_k), \qquad e_k = Q_k - C(u_k)$$
 
     (paper section 4.1, Algorithm 1, for curves). A control point that no point touches stays.
     A curve is finished when its average error is below `tolerance`, falls by less than 1 % in 8

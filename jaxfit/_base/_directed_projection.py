@@ -26,8 +26,8 @@ def directed_projection(
 
     The point p + t n with the least weighted sum of squared distances from the cloud is at
 
-    .. math:: t = \frac{\sum_m w_m\, (q_m - p) \cdot n}{\sum_m w_m}, \qquad
-              w_m = e^{-r_m^2 / 2 h^2} / (1 + d_m^2 / h^2)^2 ,
+    $$t = \frac{\sum_m w_m\, (q_m - p) \cdot n}{\sum_m w_m}, \qquad
+      w_m = e^{-r_m^2 / 2 h^2} / (1 + d_m^2 / h^2)^2 ,$$
 
     d the distance of the cloud point from p and r from the normal line. With h, the `reach`, about the
     spacing of the grid, points off the line hardly count, and of several sheets on the line the nearest

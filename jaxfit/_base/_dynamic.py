@@ -23,8 +23,8 @@ class DynamicBaseSurface(AbstractBaseMethod):
     In every round, points of the surface on a grid are moved along their normals to the weighted
     least-squares position with respect to the cloud,
 
-    .. math:: t = \sum_m w_m (q_m - p) \cdot n \Big/ \sum_m w_m, \qquad
-              w_m = e^{-r_m^2 / 2 h^2} / (1 + d_m^2 / h^2)^2
+    $$t = \sum_m w_m (q_m - p) \cdot n \Big/ \sum_m w_m, \qquad
+      w_m = e^{-r_m^2 / 2 h^2} / (1 + d_m^2 / h^2)^2$$
 
     (d the distance of the cloud point from p, r from the normal line, h the least of `reach` grid spacings
     and the mean distance to the nearest cloud points), the moves are smoothed, and the moved grid is

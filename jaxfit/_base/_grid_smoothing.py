@@ -9,8 +9,8 @@ from jaxtyping import Float
 def smoothed(moves: Float[Any, "a b d"], sure: Float[Any, "a b"], stiffness: float) -> Float[Any, "a b d"]:
     r"""The displacements D, zero on the border, that minimise
 
-    .. math:: \sum_{ij} c_{ij} |D_{ij} - T_{ij}|^2
-              + \mu \sum |\Delta_i^2 D|^2 + |\Delta_j^2 D|^2 ,
+    $$\sum_{ij} c_{ij} |D_{ij} - T_{ij}|^2
+      + \mu \sum |\Delta_i^2 D|^2 + |\Delta_j^2 D|^2 ,$$
 
     T the moves, c (0 to 1) how sure each is, and second differences along both directions. Displacements
     rather than positions: where the confidence is 0 the grid keeps its shape.

@@ -20,8 +20,8 @@ class Meshless(AbstractBaseMethod):
 
     The control points inside minimise
 
-    .. math:: \sum_k w_k |R(u_k, v_k) - Q_k|^2
-              + \lambda \int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2 \, du\, dv ,
+    $$\sum_k w_k |R(u_k, v_k) - Q_k|^2
+      + \lambda \int |R_{uu}|^2 + 2 |R_{uv}|^2 + |R_{vv}|^2 \, du\, dv ,$$
 
     those of the border stay with the boundary curves. Along the sides, parameters by chord length are taken
     over to the parameters of these curves. Parameters come from neighbours, not from a projection, so
@@ -60,6 +60,9 @@ class Meshless(AbstractBaseMethod):
     order of the points nor, beyond rounding and for clouds that are not thinned, on translation, rotation
     and scale. Takes 1 s for 6,000 points and 5 s for 25,000 on one core, several times as long where noise is
     coarser than the points are dense.
+
+    Source: M. S. Floater and M. Reimers, Computer-Aided Geometric Design 18 (2001), for the parameters; the
+    smoothed surface and its loss of weights are this library's own.
 
     Raises
     ------

@@ -37,8 +37,8 @@ def meshless_parameters(
     The sides of the boundary go to those of the square by chord length, corners to corners. Every other
     point is a convex combination of neighbours,
 
-    .. math:: (u_i, v_i) = \sum_j \lambda_{ij} (u_j, v_j), \qquad \lambda_{ij} > 0, \quad
-              \textstyle\sum_j \lambda_{ij} = 1,
+    $$(u_i, v_i) = \sum_j \lambda_{ij} (u_j, v_j), \qquad \lambda_{ij} > 0, \quad
+      \textstyle\sum_j \lambda_{ij} = 1,$$
 
     one sparse linear system. The neighbours are the Delaunay star of the point in its tangent
     plane, with mean-value weights: a flat cloud with a boundary to scale keeps its shape however its

@@ -19,11 +19,13 @@ from jaxfit._checks import as_points, is_concrete
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._precision import bucket, working_dtype
+from jaxfit._progress_line import doing, shows_progress
 from jaxfit._splines import BSplineSurface
 
 _LARGEST_GROUP = 16  # fits that go to a worker at once
 
 
+@shows_progress("fitting clouds")
 def map_fits(
     clouds: ArrayLike | Sequence[ArrayLike],
     base: BSplineSurface | Sequence[BSplineSurface],
@@ -129,8 +131,12 @@ def _run(requests: list[Request], executor: Executor | None, options: dict[str, 
 def _in_groups(requests: list[Request], executor: Executor, options: dict[str, Any], size: int) -> list[Fit]:
     groups = [requests[i : i + size] for i in range(0, len(requests), size)]
     futures = [executor.submit(_fit_group, group, options) for group in groups]
+    fits: list[Fit] = []
     try:
-        return [fit for future in futures for fit in future.result()]
+        for future in futures:
+            doing(f"fitting clouds, {len(fits)} of {len(requests)}")
+            fits += future.result()
+        return fits
     finally:
         for future in futures:
             future.cancel()

@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import jax
 
+from jaxfit._checks import check_number
 from jaxfit._precision import working_dtype
 
 _HANDED_ON = (
@@ -32,6 +33,13 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
     workers : int, optional
         How many (default: one for each core).
 
+    Raises
+    ------
+    ValueError
+        For fewer than one.
+    TypeError
+        If `workers` is no whole number.
+
     Notes
     -----
     As always with processes that are not forks, a script has to start its work below
@@ -44,6 +52,8 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
     >>> callable(jf.worker_processes)
     True
     """
+    if workers is not None:
+        check_number("workers", workers, 1, whole=True)
     pool = started_processes(cores() if workers is None else workers)
     try:
         yield pool

@@ -23,6 +23,7 @@ from jaxfit._closest._foot_methods import AbstractFootMethod, Newton
 from jaxfit._closest._implicit import foot_parameters
 from jaxfit._closest._nearest_feet import nearest_feet
 from jaxfit._precision import advise_x64, default_foot_tolerance
+from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import as_surface_arrays, make_axis
@@ -80,6 +81,7 @@ class ClosestPoint(eqx.Module):
     steps: Int[Array, " points"]
 
 
+@shows_progress("searching closest points")
 @eager_where_concrete
 def closest_point(
     surface: BSplineSurface | BSplineCurve,

@@ -43,13 +43,40 @@ def update_feet(
 ) -> tuple[FootUpdate, Any]:
     r"""Local feet of `target` from the last ones (u, v), and the `sums` over the residuals there.
 
-    `tolerance` is the largest tangential part of a residual, a length; `idle` points stay where they are and
-    take no part. `within` are bounds (low_u, high_u, low_v, high_v) of every foot's own. `weight` is how much
-    each point counts in the sums, 1 without it. A foot that is not found within `max_steps` evaluations
-    is the best point so far.
+    Parameters
+    ----------
+    method : Newton() or HuWallner()
+    pieces : Pieces
+        Those of the surface, `WorkingSurface.pieces`.
+    target : array (d, points)
+    u, v : array (points,)
+        Where the search begins.
+    tolerance : array ()
+        The largest tangential part of a residual, a length.
+    idle : array (points,) of bool
+        Points that stay where they are and take no part.
+    max_steps : int
+        Evaluations of the surface (default 40); a foot not found with these is the best point so far.
+    single_step : bool, default False
+        Whether every foot takes one step $(\delta u, \delta v)$ only; its residual is the one predicted
+        there, $e - R_u \delta u - R_v \delta v$. May be traced, and needs `sums`.
+    within : tuple of four arrays (points,), optional
+        Bounds of every foot's own: low_u, high_u, low_v, high_v.
+    sums : ControlPointSums(), optional
+        What is summed over the residuals at the feet.
+    weight : array (points,), optional
+        How much each point counts in the sums (default 1).
 
-    Where `single_step` holds (which may be traced, and needs `sums`), every foot takes one step $(\delta u,
-    \delta v)$, and its residual is the one predicted there, $e - R_u \delta u - R_v \delta v$.
+    Returns
+    -------
+    feet : FootUpdate
+        Arrays `u`, `v`, `error` (0 for idle points), `evaluations` and `converged`, each (points,).
+    sums : pytree
+        What `sums` gives; empty without it.
+
+    Notes
+    -----
+    Source: the feet of section 4.1 of Kineri, Wang, Lin and Maekawa (2012), with the step of the `method`.
 
     Examples
     --------

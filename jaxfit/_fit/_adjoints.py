@@ -38,6 +38,10 @@ class UnrolledAdjoint(AbstractAdjoint):
         Through how many moves; default as many as move feet, `freeze_after`, or 200 where feet are never
         held. Reverse mode runs each a second time and keeps one net for each. Interpolation only.
 
+    Notes
+    -----
+    Source: the derivative of equations (13) and (14) of Kineri, Wang, Lin and Maekawa (2012).
+
     Examples
     --------
     >>> import jaxfit as jf
@@ -86,6 +90,11 @@ class ImplicitAdjoint(AbstractAdjoint):
     ------
     ValueError
         If a number is out of range.
+
+    Notes
+    -----
+    Source: the implicit function theorem, as in M. Blondel et al., Efficient and modular implicit
+    differentiation, NeurIPS 35 (2022).
 
     Examples
     --------

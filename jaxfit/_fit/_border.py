@@ -106,7 +106,17 @@ class FixedSides(AbstractBorder):
 def held_points(border: AbstractBorder, shape: tuple[int, ...], used: Any) -> Bool[Any, "nu nv"]:
     """The control points that do not move: those that `border` holds, and surplus ones.
 
-    `shape` begins with (nu, nv); `used` (2,) says how many of these are in use.
+    Parameters
+    ----------
+    border : FixedBorder(), FixedCorners(), FixedSides(...) or FreeBorder()
+    shape : tuple of int
+        Begins with (nu, nv).
+    used : array (2,) of int
+        How many control points along u and v are in use; those after them are surplus.
+
+    Returns
+    -------
+    array (nu, nv) of bool
 
     Examples
     --------

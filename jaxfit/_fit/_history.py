@@ -19,9 +19,15 @@ MOST_ENTRIES = 1 << 16  # the last so many iterations are kept
 class ErrorHistory(eqx.Module):
     """One entry for each iteration, NaN where there is none yet. New entries replace the oldest ones.
 
-    Rows of `errors`: average and maximum error as fractions of the diagonal; evaluations of the surface per
-    foot, and change of a foot's parameters since the iteration before, both on average. Rows of `counts`:
-    points that took part, and control points along u and v.
+    Attributes
+    ----------
+    errors : array (4, steps)
+        Average and maximum error as fractions of the diagonal; evaluations of the surface per foot, and
+        change of a foot's parameters since the iteration before, both on average.
+    counts : array (3, steps) of int
+        Points that took part, and control points along u and v.
+    first : array ()
+        The average error of the first surface.
 
     Examples
     --------
@@ -33,7 +39,7 @@ class ErrorHistory(eqx.Module):
 
     errors: Float[Any, "4 steps"]
     counts: Int[Any, "3 steps"]
-    first: Float[Any, ""]  # average error of the first surface
+    first: Float[Any, ""]
 
     @staticmethod
     def empty(max_steps: int, dtype: Any) -> "ErrorHistory":

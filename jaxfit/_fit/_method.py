@@ -21,7 +21,15 @@ from jaxfit._fit._working_surface import WorkingSurface
 class Iterate(eqx.Module):
     """A surface, the projection of the points onto it, the method's state, and the number of moves so far.
 
-    Until the surface has been measured, `projection` is that of the last iterate.
+    Attributes
+    ----------
+    surface : WorkingSurface
+    projection : Projection
+        Until the surface has been measured, that of the last iterate.
+    state : pytree
+        What the method remembers.
+    step : array () of int
+        The number of moves so far.
 
     Examples
     --------

@@ -25,6 +25,11 @@ class Stationarity(eqx.Module):
     penalty : AbstractPenalty, optional
         S, the smoothing term, a quadratic form; its own coefficients may depend on the surface.
 
+    Notes
+    -----
+    Source: the gradient of the sum of squared distances, with the smoothing term of equation (10) of Kineri,
+    Wang, Lin and Maekawa (2012). Moving feet add nothing to it, for their residuals are orthogonal.
+
     Examples
     --------
     >>> at_rest = jf.Stationarity(weight=np.ones(5), held=np.zeros((4, 4), bool))

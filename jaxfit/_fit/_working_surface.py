@@ -19,6 +19,14 @@ class WorkingSurface(eqx.Module):
     A surface that gets more knots during the fit has room for them: surplus control points after the last one
     in use, and as many repeats of the last knot. Neither has any influence.
 
+    Attributes
+    ----------
+    control_points : array (nu, nv, d)
+    knots_u : array (nu + K,)
+    knots_v : array (nv + L,)
+    axis_u, axis_v : Axis
+        The knots of each direction, prepared for evaluation; made by `WorkingSurface.of`.
+
     Examples
     --------
     >>> net, knots_u = np.zeros((5, 3, 3)), jf.clamped_uniform_knots(5, 4)

@@ -62,6 +62,10 @@ class Chebyshev(AbstractAcceleration):
     margin : float
         By how much the bounds, found at averaged parameters and with weights taken into account, are widened.
 
+    Notes
+    -----
+    Source: Y. Saad, Iterative Methods for Sparse Linear Systems, second edition (2003), section 12.3.
+
     Examples
     --------
     >>> import jaxfit as jf

@@ -118,6 +118,13 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         some 600 iterations counts as stalled. Inside transformations (`jit`, `grad`, `vmap`) nothing is
         solved, and such a fit ends as stalled; use `StandardInterpolation` there.
 
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    TypeError
+        If a choice is not one of its kind, or an option is no number.
+
     Notes
     -----
     It converges where the eigenvalues of the collocation matrix at the feet, times the weights, lie between

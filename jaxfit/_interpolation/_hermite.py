@@ -46,6 +46,13 @@ class NormalInterpolation(AbstractDirectInterpolation):
         The largest angle allowed between the surface's normal and a given one, in radians. Default 1e-9 in
         float64, 1e-3 in float32.
 
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    TypeError
+        If a choice is not one of its kind, or an option is no number.
+
     Notes
     -----
     Normals may all point to either side of the surface. Where one lies nearly in the surface through the

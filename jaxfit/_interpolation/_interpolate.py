@@ -21,8 +21,10 @@ from jaxfit._interpolation._geometric import GeometricInterpolation
 from jaxfit._interpolation._hermite import NormalInterpolation
 from jaxfit._interpolation._method import CORNERS, AbstractInterpolation, Frame, GridProblem, Progress
 from jaxfit._precision import interpolation_tolerance, working_dtype
+from jaxfit._progress_line import shows_progress
 
 
+@shows_progress("interpolating a grid")
 @eager_where_concrete
 def interpolate(
     grid: ArrayLike,

@@ -50,6 +50,13 @@ class StandardInterpolation(AbstractDirectInterpolation):
     restart : int, default 20
         Iterations in a cycle of GMRES; it needs memory for as many nets.
 
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    TypeError
+        If a choice is not one of its kind, or an option is no number.
+
     Notes
     -----
     The tensor product always has a solution (Schoenberg-Whitney), with derivatives of any order in the

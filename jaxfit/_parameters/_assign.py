@@ -35,16 +35,31 @@ def curve_parameters(
 ) -> Float[Array, " points"]:
     r"""Parameters of a row of points on [0, 1], strictly increasing.
 
-    .. math:: u_0 = 0, \qquad u_i = u_{i-1} + |Q_i - Q_{i-1}|^a / \sum_k |Q_k - Q_{k-1}|^a,
+    $$u_0 = 0, \qquad u_i = u_{i-1} + |Q_i - Q_{i-1}|^a / \sum_k |Q_k - Q_{k-1}|^a,$$
 
     with `a = method.exponent`. A step shorter than eps^(1/3) of the mean step (6e-6 in float64,
     5e-3 in float32), such as that between two equal neighbours, is lengthened to that and the
     whole rescaled, so that knots averaged from the result never coincide.
 
-    Parameters: `points` (n, d), n >= 2, any unit; `method`, `ChordLength()` or `Centripetal()`.
+    Parameters
+    ----------
+    points : array (n, d)
+        At least two, in any unit.
+    method : ChordLength() or Centripetal()
 
-    Raises ValueError for fewer than two points, NaNs, and points that are all equal. Inside
-    `jit` values cannot be checked: points that are all equal then give uniform parameters.
+    Returns
+    -------
+    array (n,)
+
+    Raises
+    ------
+    ValueError
+        For fewer than two points, NaNs, and points that are all equal. Inside `jit` values cannot be
+        checked: points that are all equal then give uniform parameters.
+
+    Notes
+    -----
+    Source: NURBS Book, equations (9.4) to (9.6).
 
     Examples
     --------
@@ -75,11 +90,26 @@ def grid_parameters(grid: ArrayLike, method: AbstractParametrisation = _CHORD_LE
     parameters of its own: it is left out of the average and takes the average itself in
     `rows_u` (`rows_v`). `rows_u` and `rows_v` may repeat values where points repeat.
 
-    Parameters: `grid` (n, m, d), n, m >= 2, any unit; `method`, `ChordLength()` or
-    `Centripetal()`. Jit, vmap and grad work.
+    Parameters
+    ----------
+    grid : array (n, m, d)
+        At least 2 x 2 points, in any unit. Jit, vmap and grad work.
+    method : ChordLength() or Centripetal()
 
-    Raises ValueError for a grid with fewer than 2 x 2 points, for NaNs, and where the rows of one
-    direction are all degenerate (inside `jit` that gives uniform parameters instead).
+    Returns
+    -------
+    GridParameters
+        Arrays `u` (n,), `v` (m,), `rows_u` (n, m) and `rows_v` (n, m).
+
+    Raises
+    ------
+    ValueError
+        For a grid with fewer than 2 x 2 points, for NaNs, and where the rows of one direction are all
+        degenerate (inside `jit` that gives uniform parameters instead).
+
+    Notes
+    -----
+    Source: NURBS Book, algorithm A9.3.
 
     Examples
     --------

@@ -115,6 +115,9 @@ def regularity(surface: BSplineSurface, samples: int | None = None) -> Regularit
 
     Notes
     -----
+    Source: the definition above is this library's own; energies are those of `curvature_energy` and equation
+    (10) of Kineri, Wang, Lin and Maekawa (2012).
+
     Nothing compiles. With 42 x 42 control points it takes about 20 ms, with 200 x 200 some 400 ms.
 
     Examples

@@ -47,7 +47,7 @@ def zebra(
     ----------
     surface : BSplineSurface
         In three dimensions.
-    u, v : array
+    u, v : arrays of any shape
         Parameters; the two broadcast against each other.
     direction : array (3,)
         The axis $\mathbf a$ of the lights, of any length (default y). Stripes run roughly across it.

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._progress_line import doing
 from jaxfit._scan._cleaning import Cleaned, cleaned
 from jaxfit._scan._extras import import_shapely
 from jaxfit._scan._flat_places import Rectangle, rectangle_around
@@ -66,6 +67,7 @@ def sheet_of(
 ) -> Sheet:
     """Clean the points, connect them, and lay the sheet out in the unit square."""
     import_shapely()  # a missing extra is to be said first
+    doing("cleaning the points")
     clean = cleaned(points)
     if len(clean.kept) < LEAST_POINTS:
         raise ValueError(
@@ -77,6 +79,7 @@ def sheet_of(
     size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     cloud = (cloud - centre) / size
     asked = None if hole_length is None else hole_length / size
+    doing("connecting neighbours to a mesh")
     mesh, length = sheet_mesh(cloud, _given_faces(points, clean, faces), asked)
     rectangle: Rectangle = rectangle_around(mesh.flat)
     on_sheet = mesh.away <= length

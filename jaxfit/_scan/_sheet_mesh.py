@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxfit._progress_line import doing
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
@@ -73,6 +74,7 @@ def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces,
     stray = _next_to(cloud, nodes, _separate(nodes, before, used, GAP * length), used)
     nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
     loops = sheet_loops(nodes, faces)
+    doing(f"laying {len(faces):,} triangles out flat")
     flat = flat_places(nodes, faces, loops)
     places, away = carried_places(cloud, nodes, faces, flat)
     return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))

@@ -22,6 +22,10 @@ class BezierCurves(NamedTuple):
     breakpoints : array (spans + 1,)
         Piece $s$ covers the parameters between breakpoints $s$ and $s + 1$.
 
+    Notes
+    -----
+    Source: NURBS Book, equation (1.7).
+
     Examples
     --------
     >>> curve = jf.BSplineCurve(np.array([[0.0], [1.0], [0.0]]), np.array([0.0, 0.0, 0.5, 1.0, 1.0]))

@@ -14,13 +14,16 @@ Partials = dict[tuple[int, int], Array]
 class FirstForm(NamedTuple):
     r"""First fundamental form $E\,du^2 + 2 F\,du\,dv + G\,dv^2$: lengths on a surface.
 
-    Each coefficient has the shape of the parameters, and the unit length^2. From
-    `BSplineSurface.first_form`, in any dimension.
+    The unit is length^2. From `BSplineSurface.first_form`, in any dimension.
 
     Attributes
     ----------
-    E, F, G : array
+    E, F, G : array, of the shape of the parameters
         $R_u \cdot R_u$, $R_u \cdot R_v$, $R_v \cdot R_v$.
+
+    Notes
+    -----
+    Source: M. P. do Carmo, Differential Geometry of Curves and Surfaces, section 2.5.
 
     Examples
     --------
@@ -39,13 +42,16 @@ class FirstForm(NamedTuple):
 class SecondForm(NamedTuple):
     r"""Second fundamental form $L\,du^2 + 2 M\,du\,dv + N\,dv^2$: distances from the tangent plane.
 
-    Each coefficient has the shape of the parameters, and the unit length. From
-    `BSplineSurface.second_form`, in three dimensions.
+    The unit is length. From `BSplineSurface.second_form`, in three dimensions.
 
     Attributes
     ----------
-    L, M, N : array
+    L, M, N : array, of the shape of the parameters
         $R_{uu} \cdot n$, $R_{uv} \cdot n$, $R_{vv} \cdot n$ with the unit normal n.
+
+    Notes
+    -----
+    Source: M. P. do Carmo, Differential Geometry of Curves and Surfaces, section 3.3.
 
     Examples
     --------
@@ -62,18 +68,22 @@ class SecondForm(NamedTuple):
 
 
 class Curvature(NamedTuple):
-    r"""Curvatures of a surface, each of the shape of the parameters; units 1/length.
+    r"""Curvatures of a surface, in 1/length.
 
     Attributes
     ----------
-    gaussian : array
+    gaussian : array, of the shape of the parameters
         $k_1 k_2 = (L N - M^2) / (E G - F^2)$, in 1/length^2.
-    mean : array
+    mean : array, of the shape of the parameters
         $(k_1 + k_2) / 2 = (E N - 2 F M + G L) / (2 (E G - F^2))$.
-    k1, k2 : array
+    k1, k2 : array, of the shape of the parameters
         Principal curvatures, $k_1 \ge k_2$; positive where the surface bends towards the normal
         $R_u \times R_v$. At umbilics ($k_1 = k_2$) they have no derivative, and automatic
         differentiation gives that of the mean curvature.
+
+    Notes
+    -----
+    Source: M. P. do Carmo, Differential Geometry of Curves and Surfaces, section 3.3.
 
     Examples
     --------

@@ -62,6 +62,10 @@ def insertion_matrix(
         Row $j$ holds at most `order` entries, non-negative and of sum one. The spline is the
         same function to rounding.
 
+    Notes
+    -----
+    Source: E. Cohen, T. Lyche and R. Riesenfeld, Computer Graphics and Image Processing 14 (1980).
+
     Examples
     --------
     A knot in the middle of a parabola without interior knots cuts both legs of its control polygon:

@@ -23,8 +23,8 @@ def clamped_uniform_knots(
         Number of control points, at least `order`.
     order : int
         Degree + 1, at least 1.
-    domain : (start, stop)
-        Repeated `order` times each at the two ends.
+    domain : array (2,)
+        Start and stop (default 0 and 1), repeated `order` times each at the two ends.
 
     Raises
     ------
@@ -124,6 +124,10 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
     ValueError
         If the order is below 2 or not below the number of knots.
 
+    Notes
+    -----
+    Source: C. de Boor, A Practical Guide to Splines, revised edition (2001), chapter IX.
+
     Examples
     --------
     >>> [round(float(x), 3) for x in jf.greville_abscissae(jf.clamped_uniform_knots(5, 4), 4)]
@@ -146,9 +150,10 @@ def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) 
 
     Parameters
     ----------
-    a, b : array
+    a, b : arrays (n_a,), (n_b,)
         Knot vectors of the same order on the same domain.
     order : int
+        Degree + 1.
     tolerance : float, default 0
         Knots of `b` this close to one of `a` (in the units of the knots) count as that knot of
         `a`, so that rounding does not breed slivers of spans. What is snapped is exact no

@@ -10,11 +10,13 @@ from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._fit._loop import Progress
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
+from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineSurface
 from jaxfit._streams._blocks import Source
 from jaxfit._streams._stream_fit import fit_stream
 
 
+@shows_progress("reading a cloud")
 def approximate_stream(
     source: Source,
     base: BSplineSurface,

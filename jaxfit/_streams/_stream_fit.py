@@ -23,6 +23,7 @@ from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, Name, converged_or_raise
 from jaxfit._fit._scaling import Unit, unit_of
 from jaxfit._precision import advise_x64, working_dtype
+from jaxfit._progress_line import doing
 from jaxfit._splines import BSplineSurface
 from jaxfit._streams._blocks import Blocks, Source
 from jaxfit._streams._methods import by_sums, static_and_numbers
@@ -149,6 +150,7 @@ def _run(
     """The loop of `_fit/_loop.py` on the host: a pass, then what follows from its sums."""
     counted = np.asarray(passes.counted, np.int32)
     while int(loop.code) == code_of(RESULTS.running):
+        doing(f"pass {int(loop.next.step) + 1} over {passes.blocks.count:,} points")
         measured = passes.measure(loop.next, loop.exact, searched)
         searched = None
         loop = _advance(*static_and_numbers(passes.method), problem, loop, measured, counted)

@@ -29,6 +29,14 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = _SURFACES)
     InputError
         For an unknown suffix, a library that is not installed, a missing folder, a folder in place of a
         file, and a folder in which no file can be made.
+
+    Examples
+    --------
+    >>> try:
+    ...     jf.io.check_output("surface.xyz", suffixes=(".npz", ".json"))
+    ... except jf.io.InputError as error:
+    ...     print(error)
+    surface.xyz has the suffix .xyz, so its format is not known; use one of .npz, .json.
     """
     path = Path(path)
     if path.suffix.lower() not in suffixes:

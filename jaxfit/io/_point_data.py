@@ -10,7 +10,16 @@ from jaxfit._base import Boundary
 
 
 class InputError(ValueError):
-    """A file cannot be used; the message is one sentence that names it and says what to do."""
+    """A file cannot be used; the message is one sentence that names it and says what to do.
+
+    Examples
+    --------
+    >>> try:
+    ...     jf.io.read_points("nowhere.npy")
+    ... except jf.io.InputError as error:
+    ...     print(error)
+    nowhere.npy does not exist; check its name and folder.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,23 +28,29 @@ class PointData:
 
     Parameters
     ----------
-    points
+    points : array (N, 3), optional
         Scattered points, float64, in file order; None for a grid.
-    grid
+    grid : array (n, m, 3), optional
         Points in rows and columns, float64: the first index runs along u, the second along v;
         None for scattered points.
-    boundary
+    boundary : Boundary, optional
         The four border polylines: as stored beside scattered points, or the edges of a grid
         (None where the edges make no boundary, for instance because one of them is a single
         point). None when nothing is known about the border.
-    name
+    name : str
         Short name for tables and titles: the file's name without folder and suffix.
-    left_out
+    left_out : dict of int
         Of a scanner's file or a mesh: how many of its points are not in `points`, by reason; empty if
         all are. The reasons are "withheld" and "classified as noise" (LAS), "invalid" (E57),
         "not finite", and of meshes "in no face" and "repeated".
-    faces
+    faces : array (faces, 3) of int, optional
         Of a mesh: the numbers of the `points` at the corners of each triangle; None otherwise.
+
+    Examples
+    --------
+    >>> data = jf.io.PointData(points=np.zeros((6, 3)), grid=None, boundary=None, name="six")
+    >>> data.as_grid(3, 2).grid.shape
+    (3, 2, 3)
     """
 
     points: Float[np.ndarray, "points 3"] | None

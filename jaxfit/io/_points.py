@@ -100,10 +100,28 @@ def read_points(path: str | os.PathLike) -> PointData:
 def read_boundary(path: str | os.PathLike) -> Boundary:
     """The four border polylines in the keys ``boundary_*`` of an .npz file.
 
+    Parameters
+    ----------
+    path
+        The file; `read_points` says what the keys hold.
+
+    Returns
+    -------
+    Boundary
+
     Raises
     ------
     InputError
         If the file cannot be read, a polyline is missing, or their corners do not meet.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "square.npz"
+    >>> sides = dict(boundary_v0=[[0.0, 0, 0], [1, 0, 0]], boundary_v1=[[0.0, 1, 0], [1, 1, 0]])
+    >>> np.savez(path, **sides, boundary_u0=[[0.0, 0, 0], [0, 1, 0]], boundary_u1=[[1.0, 0, 0], [1, 1, 0]])
+    >>> jf.io.read_boundary(path).v1.tolist()
+    [[0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]
     """
     path = Path(path)
     check_input(path, (".npz",))

@@ -135,6 +135,11 @@ def _content(path: Path, surface: BSplineSurface, trimmed: TrimmedSurface | None
 def read_surface(path: str | os.PathLike) -> BSplineSurface | TrimmedSurface:
     """Read a surface that `write_surface` or geomdl's ``export_json`` wrote.
 
+    Parameters
+    ----------
+    path
+        The file, ``.npz`` or ``.json``.
+
     Returns
     -------
     BSplineSurface or TrimmedSurface
@@ -144,6 +149,14 @@ def read_surface(path: str | os.PathLike) -> BSplineSurface | TrimmedSurface:
     ------
     InputError
         If the file cannot be read, holds no surface or more than one, or a rational one.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> path, knots = pathlib.Path(tempfile.mkdtemp()) / "flat.npz", np.array([0.0, 0, 1, 1])
+    >>> _ = jf.io.write_surface(path, jf.BSplineSurface(np.zeros((2, 2, 3)), knots, knots))
+    >>> jf.io.read_surface(path).shape
+    (2, 2)
     """
     path = Path(path)
     check_input(path, (".npz", ".json"))

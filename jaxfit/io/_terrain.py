@@ -26,6 +26,11 @@ def jacksboro() -> PointData:
     ------
     InputError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> jf.io.jacksboro().grid.shape
+    (403, 344, 3)
     """
     try:
         from matplotlib.cbook import get_sample_data

@@ -37,6 +37,13 @@ def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi:
     ------
     ImportError
         If Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> fit = jf.interpolate(np.stack([x, y, x * y], axis=2), jf.StandardInterpolation())
+    >>> jf.plot.loops(fit).get_size_inches().tolist()
+    [7.0, 5.2]
     """
     figure = blank_figure(7)
     axes = figure.subplots()

@@ -49,7 +49,7 @@ def surface_and_errors(
     ----------
     fit
         What `jaxfit.interpolate`, `jaxfit.approximate` or `jaxfit.fit_points` returned.
-    points
+    points : array (N, d) or (n, m, d), optional
         The data. Needed only for a grid (n, m, d) that was fitted as scattered points, row by
         row: its errors are then drawn in rows and columns.
     path
@@ -69,6 +69,13 @@ def surface_and_errors(
         If Matplotlib is not installed.
     ValueError
         If `points` is a grid whose size is not the number of errors.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> fit = jf.interpolate(np.stack([x, y, x * y], axis=2), jf.StandardInterpolation())
+    >>> jf.plot.surface_and_errors(fit, title="a saddle").get_size_inches().tolist()
+    [12.0, 5.2]
     """
     errors = _arrange(fit.errors, points)
     figure = blank_figure(12)

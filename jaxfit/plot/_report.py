@@ -82,6 +82,16 @@ def report(
         If Matplotlib is not installed.
     OSError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> fit = jf.interpolate(np.stack([x, y, x * y], axis=2), jf.StandardInterpolation())
+    >>> page = pathlib.Path(tempfile.mkdtemp()) / "saddle.html"
+    >>> jf.plot.report(fit, page, title="A saddle")
+    >>> "A saddle" in page.read_text()
+    True
     """
     rows = {
         **(tables or {}),

@@ -53,10 +53,10 @@ def zebra_stripes(
         One for each surface, or none.
     stripes
         Bright stripes in half a turn of the reflected ray (default 16).
-    direction
-        Axis of the lights (3,), across which stripes run. Default: upward in the picture.
-    view
-        Direction from the surfaces to the eye (3,). Default: the outer side of the first surface. To
+    direction : array (3,), optional
+        Axis of the lights, across which stripes run. Default: upward in the picture.
+    view : array (3,), optional
+        Direction from the surfaces to the eye. Default: the outer side of the first surface. To
         judge a symmetry, look along its plane.
     title
         Heading, for instance the name of the data.
@@ -75,6 +75,13 @@ def zebra_stripes(
         If Matplotlib is not installed.
     ValueError
         If there is no surface, one is not in three dimensions, or there are more or fewer captions.
+
+    Examples
+    --------
+    >>> x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    >>> fit = jf.interpolate(np.stack([x, y, x * y], axis=2), jf.StandardInterpolation())
+    >>> jf.plot.zebra_stripes(fit.surface).get_size_inches().tolist()
+    [6.0, 5.2]
     """
     drawn = _checked(surfaces, captions)
     camera = _camera(drawn[0], view)
