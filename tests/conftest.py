@@ -30,9 +30,13 @@ def pytest_addoption(parser):
     )
 
 
-def compile_with_the_short_code_generator():
-    """Halve what compiling costs, where XLA has the choice: an unknown flag would end the process."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+# The short code generator, which halves what compiling costs, and one module a program instead of many.
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+
+
+def compile_quickly():
+    """Pass XLA the flags in QUICK where it knows them: an unknown flag would end the process."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
     trial = [sys.executable, "-c", "import jax; jax.devices()"]
     known = subprocess.run(trial, env={**os.environ, "XLA_FLAGS": flags}, capture_output=True, check=False)
     if known.returncode == 0:
@@ -42,7 +46,7 @@ def compile_with_the_short_code_generator():
 def pytest_configure(config):
     # The second pass runs the code that users get.
     if not config.getoption("--float32") and not hasattr(config, "workerinput"):
-        compile_with_the_short_code_generator()
+        compile_quickly()
     jax.config.update("jax_enable_x64", not config.getoption("--float32"))
     jax.config.update("jax_numpy_rank_promotion", "raise")
     # Most of the session is compiling tiny problems; unoptimised code is as correct and compiles faster.

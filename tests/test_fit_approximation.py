@@ -354,15 +354,12 @@ def test_an_option_that_there_is_none_gets_a_sentence():
         jf.fit_points(POINTS, BOUNDARY, tolerance=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("name", "net", "average"),
-    [("igea_face", (42, 42), 3e-4)],
-)
-def test_real_scans_are_fitted_from_their_boundaries(name, net, average):
-    arrays = data(name)
+def test_a_real_scan_is_fitted_from_its_boundary():
+    arrays = data("igea_face")
     sides = {key[-2:]: arrays[key] for key in arrays if key.startswith("boundary_")}
-    fit = jf.fit_points(arrays["points"], jf.Boundary(**sides), net=net, max_steps=15, tol_average=1e-4)
-    assert float(fit.average_error) < average
+    some, options = arrays["points"][::4], dict(net=(24, 24), max_steps=15, tol_average=1e-4)
+    fit = jf.fit_points(some, jf.Boundary(**sides), **options)
+    assert float(fit.average_error) < 5.5e-4
     assert fit.history.average[-1] < fit.history.average[0]
     assert np.isfinite(np.asarray(fit.surface.control_points)).all()
 

@@ -53,7 +53,7 @@ def test_noise_ends_the_growth_and_is_not_followed():
     away = np.asarray(jf.closest_point(fit.surface, CLEAN).distance).mean() / size
     fixed = [jf.fit_points(noisy, BOUNDARY, net=(n, n), tol_average=1e-6, max_steps=20) for n in (10, 24)]
     others = [np.asarray(jf.closest_point(x.surface, CLEAN).distance).mean() / size for x in fixed]
-    assert away < 1.4 * min(others)  # measured: 1.32
+    assert away < 1.35 * min(others)  # measured: 1.32
     assert away < 0.4 * noise
 
 
@@ -63,7 +63,7 @@ def test_a_tolerance_that_the_points_do_not_carry_is_reported():
     assert fit.result in (jf.RESULTS.net_exhausted, jf.RESULTS.noise_reached)
     assert not fit.converged
     with pytest.raises(RuntimeError, match="tolerances"):
-        jf.fit_points(few, BOUNDARY, tol_average=1e-9, throw=True)
+        jf.fit_points(few, BOUNDARY, tol_average=1e-9, max_steps=1, throw=True)
 
 
 def test_few_points_and_other_wishes_keep_one_net():
@@ -71,7 +71,7 @@ def test_few_points_and_other_wishes_keep_one_net():
     assert few.surface.shape == (8, 8)
     inserting = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=50))
     assert jf.fit_points(CLEAN, BOUNDARY, method=inserting, max_steps=2).surface.shape == (20, 19)
-    assert jf.fit_points(CLEAN, BOUNDARY, tol_average=None).surface.shape == (20, 19)
+    assert jf.fit_points(CLEAN, BOUNDARY, tol_average=None, max_steps=1).surface.shape == (20, 19)
 
 
 def test_points_of_weight_zero_choose_no_net():

@@ -33,8 +33,8 @@ def test_points_of_weight_zero_have_no_influence(base, name):
     alone = jf.approximate(POINTS, base, METHODS[name], **OPTIONS)
     padded = jf.approximate(cloud, base, METHODS[name], weights=weights, **OPTIONS)
     difference = np.asarray(alone.surface.control_points - padded.surface.control_points)
-    assert np.abs(difference).max() < (1e-6 if name in MAGNIFIES else 1e-10)
-    rtol = 1e-5 if name in MAGNIFIES else 1e-7
+    assert np.abs(difference).max() < (1e-7 if name in MAGNIFIES else 1e-10)
+    rtol = 1e-6 if name in MAGNIFIES else 1e-7
     np.testing.assert_allclose(alone.history.average, padded.history.average, rtol=rtol)
     assert np.isclose(alone.average_error, padded.average_error, rtol=rtol)
     assert float(padded.errors[200:].min()) > 0
@@ -48,10 +48,9 @@ def test_a_batch_of_fits_is_the_fits_one_by_one(base, name):
         return jf.approximate(points, base, METHODS[name], **OPTIONS).surface.control_points
 
     batch = jax.jit(jax.vmap(net))(clouds)
-    single = jax.jit(net)
     for one, cloud in zip(batch, clouds, strict=True):
-        apart = np.abs(np.asarray(one - single(cloud))).max()
-        assert apart < (1e-6 if name in MAGNIFIES else 1e-12)
+        apart = np.abs(np.asarray(one - net(np.asarray(cloud)))).max()
+        assert apart < (1e-7 if name in MAGNIFIES else 1e-12)
 
 
 def test_other_values_of_numbers_compile_nothing(base):

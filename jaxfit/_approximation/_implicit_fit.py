@@ -86,7 +86,7 @@ def with_implicit_derivative(
 @with_implicit_derivative.defjvp
 def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any) -> Any:
     _, end, inputs = primals
-    at_rest = polished_fit(rest, adjoint, end, lax.stop_gradient(inputs))
+    at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
     return jax.jvp(partial(_implicit, rest, at_rest, end), (inputs,), tangents[2:])
 
@@ -106,23 +106,30 @@ def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
 
 def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit, with its derivative in the inputs."""
-    at_rest = polished_fit(rest, adjoint, end, lax.stop_gradient(inputs))
+    at_rest = _at_rest(rest, adjoint, end, inputs)
     if not is_concrete(inputs):
         _check_at_rest(adjoint, at_rest.stationarity)
     return _implicit(rest, at_rest, end, inputs)
 
 
-@partial(compiled, static_argnums=(0, 1))
-def polished_fit(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
+def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
+    """`polished_fit` with the numbers of the adjoint: other ones compile nothing."""
+    dtype = end.problem.target.dtype
+    goal, most = np.asarray(adjoint.goal(dtype), dtype), np.asarray(adjoint.polish_steps, np.int32)
+    return polished_fit(rest, goal, most, end, lax.stop_gradient(inputs))
+
+
+@partial(compiled, static_argnums=0)
+def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
     """`polished`; on a CPU the fits of a batch one after the other."""
 
-    def whole(end: EndOfFit, inputs: FitInputs) -> PolishedFit:
+    def whole(goal: Array, most: Array, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
         method = eqx.combine(inputs.numbers, rest)
-        return polished(method, adjoint, end.problem, end.surface, end.state, end.projection)
+        return polished(method, goal, most, end.problem, end.surface, end.state, end.projection)
 
     if jax.default_backend() == "cpu":
         whole = jax.custom_batching.sequential_vmap(whole)
-    return whole(end, inputs)
+    return whole(goal, most, end, inputs)
 
 
 @partial(compiled, static_argnums=0)

@@ -16,7 +16,6 @@ from jaxfit._approximation._stationarity_residual import (
 )
 from jaxfit._cells import values_at
 from jaxfit._closest import Newton
-from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
@@ -67,13 +66,14 @@ class _State(eqx.Module):
 
 def polished(
     method: AbstractIterativeMethod,
-    adjoint: ImplicitAdjoint,
+    goal: Float[Array, ""],
+    most: Int[Array, ""],
     problem: Problem,
     surface: WorkingSurface,
     state: Any,
     projection: Projection,
 ) -> PolishedFit:
-    r"""Newton steps until G is small enough or nothing helps any more.
+    r"""Newton steps until G, relative to its terms, is below `goal`, or `most` steps, or nothing helps.
 
     A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
     where $(G_0 + G_1) \cdot \delta P < 0$. To third order that is twice the change of the objective of which
@@ -83,7 +83,6 @@ def polished(
     still = surface.control_points
     feet = projection.u, projection.v
     free = newton_system(method, state, surface, problem, feet, projection.error).free
-    goal = adjoint.goal(still.dtype)
 
     def advance(now: _State) -> _State:
         old, there = now.accepted, surface.moved_to(now.trial)
@@ -106,7 +105,7 @@ def polished(
             move = _shortened(now.trial, system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES))
             return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
 
-        done = good & ((new.size <= least) | (now.steps >= adjoint.polish_steps))
+        done = good & ((new.size <= least) | (now.steps >= most))
         none = (old.net, jnp.zeros_like(work))
         trial, predicted = lax.cond(good & ~done, step, lambda: none)
         accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)

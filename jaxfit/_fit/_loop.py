@@ -63,7 +63,7 @@ def run(
     numbers = jax.tree.map(lambda x: np.asarray(x, problem.target.dtype) if is_concrete(x) else x, numbers)
     inputs = (numbers, problem, loop)
     if not is_concrete(inputs):
-        numbers, problem, loop = without_derivative(jax.tree.map(jnp.asarray, inputs))
+        numbers, problem, loop = jax.tree.map(jnp.asarray, inputs)
     most = problem.tolerances.max_steps
     if progress is None:
         return _advance(rest, numbers, problem, most, loop)
@@ -162,21 +162,3 @@ def _decide(
     for holds, result in reversed(outcomes):
         code = jnp.where(holds, jnp.asarray(code_of(result), jnp.int32), code)
     return code
-
-
-@jax.custom_jvp
-def without_derivative(inputs: Any) -> Any:
-    """The inputs; differentiating through this function raises.
-
-    The derivative of the iteration is not that of the fit: feet that start converged never move, so their
-    tangents would be zero.
-    """
-    return inputs
-
-
-@without_derivative.defjvp
-def _refuse(primals: Any, tangents: Any) -> Any:
-    raise TypeError(
-        "a fit has no derivative with respect to its data; differentiate functions of the fitted surface, or "
-        "closest_point, instead."
-    )
