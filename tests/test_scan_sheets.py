@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import data
 
 from jaxfit._scan import sheet_of
 from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
@@ -126,3 +127,33 @@ def test_a_band_with_a_twist_of_triangles_is_no_manifold():
     assert (pieces(kept) == 0).all()
     assert len(boundary_loops(kept)) == 1
     assert areas(np.eye(5)[:, :3], kept).shape == (2,)
+
+
+def hairpin(seed, spacing=0.7):
+    """Points of a sheet round a bend, its far sides nearer to each other than many of its neighbours, and how
+    far along the sheet each is.
+    """
+    rng = np.random.default_rng(seed)
+    along, height = np.meshgrid(np.arange(-10, 10, spacing), np.arange(0, 12, spacing), indexing="ij")
+    along, height = (x.ravel() + rng.uniform(-0.4, 0.4, x.size) * spacing for x in (along, height))
+    half = np.sign(along) * (1 - np.exp(-np.abs(along))) * (1.2 - 0.075 * np.abs(along))
+    return np.stack([np.sqrt(along**2 + 1), half, height], axis=1), along
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_sides_that_face_each_other_closely_are_not_joined(seed):
+    points, along = hairpin(seed)
+    sheet = sheet_of(points)
+    node = np.argmin(np.linalg.norm(sheet.points[None] - sheet.nodes[:, None], axis=2), axis=1)
+    assert np.ptp(along[sheet.number[node]][sheet.faces], axis=1).max() < 4
+    assert len(sheet.loops) == 1
+
+
+def test_a_thin_blade_has_no_notches_in_its_rim():
+    arrays = data("blade_wrap_3000")
+    sheet = sheet_of(arrays["points"])
+    rim = sheet.nodes[sheet.loops[0]] * sheet.size + sheet.centre
+    sides = [arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")]
+    dense = np.concatenate([np.linspace(x[:-1], x[1:], 20).reshape(-1, 3) for x in sides])
+    away = np.linalg.norm(rim[:, None] - dense[None], axis=2).min(axis=1)
+    assert away.max() < 1.5 * sheet.spacing * sheet.size
