@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers import data
 
-from jaxfit._scan import sheet_of
+from jaxfit._scan import _sheet_mesh, sheet_of
 from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
 
 pytest.importorskip("shapely")
@@ -157,3 +157,32 @@ def test_a_thin_blade_has_no_notches_in_its_rim():
     dense = np.concatenate([np.linspace(x[:-1], x[1:], 20).reshape(-1, 3) for x in sides])
     away = np.linalg.norm(rim[:, None] - dense[None], axis=2).min(axis=1)
     assert away.max() < 1.5 * sheet.spacing * sheet.size
+
+
+def roll(turns=2, around=160, along=24):
+    """Points of a sheet that is rolled up, its layers a quarter of a unit apart, and its triangles."""
+    angle, height = np.meshgrid(
+        np.linspace(0, 2 * np.pi * turns, around), np.linspace(0, 3, along), indexing="ij"
+    )
+    radius = 1 + 0.25 * angle / (2 * np.pi)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
+    first = (along * np.arange(around - 1)[:, None] + np.arange(along - 1)).ravel()
+    after = first + along
+    halves = [first, after, after + 1], [first, after + 1, first + 1]
+    return points, np.concatenate([np.stack(x, axis=1) for x in halves])
+
+
+def test_faces_of_a_large_file_tell_sheets_apart_that_are_nearer_than_the_nodes(monkeypatch):
+    monkeypatch.setattr(_sheet_mesh, "MOST_NODES", 300)
+    points, faces = roll()
+    sheet = sheet_of(points, faces=faces)
+    assert len(sheet.nodes) <= 300
+    assert sheet.on_sheet.all()
+    assert len(sheet.loops) == 1
+    whole = areas(points, faces).sum()
+    assert 0.85 * whole < sheet.area < whole  # the nodes lie inside the rim
+    rim = points.reshape(160, 24, 3)[:, 0]
+    along = np.cumsum(np.linalg.norm(np.diff(rim, axis=0, prepend=rim[:1]), axis=1)).repeat(24)[sheet.number]
+    place = sheet.places[:, 0] * sheet.size
+    place = place if np.corrcoef(place, along)[0, 1] > 0 else place.max() - place
+    assert np.abs(place - along - np.median(place - along)).max() < 1  # the layers are 6 apart and more

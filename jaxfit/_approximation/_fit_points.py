@@ -117,7 +117,8 @@ def fit_points(
     survey of a town from the air, are laid out by their principal plane instead, the mesh over medians of
     their heights. Fails where two sheets are nearer to each other than their points, for closed surfaces,
     tubes and several pieces, and where noise is coarser than the points are dense and the cloud is not level.
-    Of more than 30,000 points an even choice makes the mesh, and faces are not used.
+    Of more than 30,000 points an even choice makes the mesh; given faces then say which of these are
+    neighbours, by distances along their edges.
 
     With a `net` the fit is differentiable in points, weights and numbers of the method, as `approximate` is.
     The base surface counts as constant then: inside, where it starts from does not matter to where the fit
