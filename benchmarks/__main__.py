@@ -34,6 +34,7 @@ STUDIES = {
     "streams": "clouds in files, larger than memory",
     "orthogonal": "orthogonal distance: passes, errors, outliers",
     "pictures": "base, default and paper side by side",
+    "scans": "raw scans: what is left out, loops, areas, errors, points held out",
     "smoothing": "automatic choices of lambda",
 }
 

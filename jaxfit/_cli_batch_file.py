@@ -97,7 +97,7 @@ def _fitted(args: argparse.Namespace) -> Row:
         "iterations": int(fit.stats["num_steps"]),
         "average_error_percent": 100 * done.average,
         "maximum_error_percent": 100 * done.maximum,
-        "folds": int(fit.regularity.folds),
+        "folds": fit.folds,
         "message": fit.message,
         "seconds": round(done.seconds, 3),
     }

@@ -1,6 +1,7 @@
 """`jaxfit batch`: one table of many files, whatever is wrong with some, whoever fits them."""
 
 import csv
+import dataclasses
 import json
 import os
 import sys
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 from helpers import wavy_cloud, wavy_grid
 
+import jaxfit as jf
 from jaxfit import _cli, _cli_workers
+from jaxfit._cli_fit import FitOfFile
 from jaxfit._cli_table import COLUMNS
 from jaxfit._cli_workers import Processes, Schedule
 from jaxfit.io import read_surface
@@ -72,6 +75,24 @@ def test_bad_files_are_reported_and_passed_over(folder, capsys):
     assert batch(BAD[0], *GOOD, *BAD[1:]) == 3
     assert state() == before
     assert capsys.readouterr().err == ""
+
+
+def test_folds_are_those_inside_the_loops(folder, monkeypatch):
+    grid = wavy_grid(8, 7)
+    grid[6] = grid[4] - [0.05, 0, 0]  # folded near the last row
+    np.savez("grid.npz", grid=grid)
+    real = FitOfFile.run
+
+    def with_loops(self, progress=None):
+        done = real(self, progress)
+        assert done.fit.folds > 0
+        corners = np.array([[0, 0], [0.3, 0], [0.3, 1], [0, 1]])
+        trimmed = jf.TrimmedSurface(done.fit.surface, (corners,))
+        return done._replace(fit=dataclasses.replace(done.fit, trimmed=trimmed))
+
+    monkeypatch.setattr(FitOfFile, "run", with_loops)
+    assert _cli.main(["batch", "grid.npz", "-o", "out", "--quiet"]) == 0
+    assert rows()["grid.npz"]["folds"] == 0
 
 
 def test_what_has_changed_is_fitted_again(folder, monkeypatch):

@@ -153,3 +153,18 @@ def test_only_sums_that_rounding_decides_count_as_none():
     if single:
         expected[5, 5] = 0.0
     np.testing.assert_array_equal(kept, expected)
+
+
+def test_local_feet_that_were_lost_are_searched_on_the_whole_surface():
+    surface = wavy_surface()
+    u, v = np.random.default_rng(0).uniform(size=(2, 40))
+    points = np.asarray(surface(u, v))
+    lost = np.arange(40) % 7 == 0
+    wrong = np.where(lost, 0.0, u), np.where(lost, 1.0, v)
+    away = np.linalg.norm(np.asarray(surface(*wrong)) - points, axis=1)
+    found = jf.LocalFeet().feet(surface, points, (*wrong, away, ~lost), at_feet=True)
+    rounding = 1e4 * np.finfo(points.dtype).eps
+    np.testing.assert_allclose(found[2], 0.0, atol=rounding)
+    np.testing.assert_allclose(found[0], u, atol=rounding)
+    assert np.asarray(found[3]).all()
+    assert away.max() > 0.1

@@ -34,17 +34,6 @@ def share_inside(fit):
     return shapely.contains_xy(region(fit), u, v)[np.isfinite(u)].mean()
 
 
-def trimmed_area(fit, n=400):
-    """The area of the surface inside the loops, on a grid of quadrangles."""
-    at = np.linspace(0, 1, n + 1)
-    grid = np.asarray(fit.surface.grid(at, at))
-    first, second = grid[1:, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, 1:]
-    middle = (at[1:] + at[:-1]) / 2
-    u, v = np.meshgrid(middle, middle, indexing="ij")
-    inside = shapely.contains_xy(region(fit), u, v)
-    return (np.linalg.norm(np.cross(first, second), axis=2) / 2)[inside].sum()
-
-
 @pytest.fixture(scope="module")
 def fit():
     return jf.fit_points(scan(), net=(12, 12), tol_average=1e-4)
@@ -56,7 +45,9 @@ def test_a_scan_without_boundary_is_fitted_and_trimmed(fit):
     assert region(fit).is_valid
     assert len(fit.trimmed.loops) == 2
     assert share_inside(fit) > 0.98
-    assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
+    area = float(fit.trimmed.area())
+    assert np.isclose(area, fit.stats["sheet_area"], rtol=0.02)
+    assert np.isclose(area, fit.stats["projected_area"], rtol=0.02)
     assert fit.stats["feet_on_border"] == 0
 
 
@@ -90,6 +81,16 @@ def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
     assert np.mean(away) < 2e-4 * diagonal(points)
 
 
+def test_the_area_of_a_noisy_sheet_is_that_of_its_mesh_laid_on_the_surface(fit):
+    points = scan()
+    points[:, 2] += np.random.default_rng(1).normal(0, 0.03, len(points))
+    noisy = jf.fit_points(points, net=(7, 7), max_steps=3)
+    area = float(noisy.trimmed.area())
+    assert noisy.stats["sheet_area"] > 1.05 * area  # the mesh is rough
+    assert np.isclose(area, noisy.stats["projected_area"], rtol=0.02)
+    assert np.isclose(area, float(fit.trimmed.area()), rtol=0.03)
+
+
 def test_results_are_in_the_frame_of_the_points(fit):
     offset = np.array([5e5, 5.4e6, 100.0])
     moved = jf.fit_points(100 * scan() + offset, net=(12, 12), tol_average=1e-4)
@@ -111,7 +112,9 @@ def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
     assert fit.maximum_error <= 1.93e-3
     assert len(fit.trimmed.loops) == 1
     assert share_inside(fit) >= 0.98
-    assert np.isclose(trimmed_area(fit), fit.stats["sheet_area"], rtol=0.02)
+    area = float(fit.trimmed.area())
+    assert np.isclose(area, fit.stats["sheet_area"], rtol=0.02)
+    assert np.isclose(area, fit.stats["projected_area"], rtol=0.02)
 
 
 @pytest.mark.parametrize(

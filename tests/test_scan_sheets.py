@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from helpers import data
 
-from jaxfit._scan import sheet_of
+from jaxfit._scan import _sheet_mesh, sheet_of
 from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
 
 pytest.importorskip("shapely")
@@ -126,3 +127,62 @@ def test_a_band_with_a_twist_of_triangles_is_no_manifold():
     assert (pieces(kept) == 0).all()
     assert len(boundary_loops(kept)) == 1
     assert areas(np.eye(5)[:, :3], kept).shape == (2,)
+
+
+def hairpin(seed, spacing=0.7):
+    """Points of a sheet round a bend, its far sides nearer to each other than many of its neighbours, and how
+    far along the sheet each is.
+    """
+    rng = np.random.default_rng(seed)
+    along, height = np.meshgrid(np.arange(-10, 10, spacing), np.arange(0, 12, spacing), indexing="ij")
+    along, height = (x.ravel() + rng.uniform(-0.4, 0.4, x.size) * spacing for x in (along, height))
+    half = np.sign(along) * (1 - np.exp(-np.abs(along))) * (1.2 - 0.075 * np.abs(along))
+    return np.stack([np.sqrt(along**2 + 1), half, height], axis=1), along
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_sides_that_face_each_other_closely_are_not_joined(seed):
+    points, along = hairpin(seed)
+    sheet = sheet_of(points)
+    node = np.argmin(np.linalg.norm(sheet.points[None] - sheet.nodes[:, None], axis=2), axis=1)
+    assert np.ptp(along[sheet.number[node]][sheet.faces], axis=1).max() < 4
+    assert len(sheet.loops) == 1
+
+
+def test_a_thin_blade_has_no_notches_in_its_rim():
+    arrays = data("blade_wrap_3000")
+    sheet = sheet_of(arrays["points"])
+    rim = sheet.nodes[sheet.loops[0]] * sheet.size + sheet.centre
+    sides = [arrays[f"boundary_{side}"] for side in ("v0", "v1", "u0", "u1")]
+    dense = np.concatenate([np.linspace(x[:-1], x[1:], 20).reshape(-1, 3) for x in sides])
+    away = np.linalg.norm(rim[:, None] - dense[None], axis=2).min(axis=1)
+    assert away.max() < 1.5 * sheet.spacing * sheet.size
+
+
+def roll(turns=2, around=160, along=24):
+    """Points of a sheet that is rolled up, its layers a quarter of a unit apart, and its triangles."""
+    angle, height = np.meshgrid(
+        np.linspace(0, 2 * np.pi * turns, around), np.linspace(0, 3, along), indexing="ij"
+    )
+    radius = 1 + 0.25 * angle / (2 * np.pi)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=2).reshape(-1, 3)
+    first = (along * np.arange(around - 1)[:, None] + np.arange(along - 1)).ravel()
+    after = first + along
+    halves = [first, after, after + 1], [first, after + 1, first + 1]
+    return points, np.concatenate([np.stack(x, axis=1) for x in halves])
+
+
+def test_faces_of_a_large_file_tell_sheets_apart_that_are_nearer_than_the_nodes(monkeypatch):
+    monkeypatch.setattr(_sheet_mesh, "MOST_NODES", 300)
+    points, faces = roll()
+    sheet = sheet_of(points, faces=faces)
+    assert len(sheet.nodes) <= 300
+    assert sheet.on_sheet.all()
+    assert len(sheet.loops) == 1
+    whole = areas(points, faces).sum()
+    assert 0.85 * whole < sheet.area < whole  # the nodes lie inside the rim
+    rim = points.reshape(160, 24, 3)[:, 0]
+    along = np.cumsum(np.linalg.norm(np.diff(rim, axis=0, prepend=rim[:1]), axis=1)).repeat(24)[sheet.number]
+    place = sheet.places[:, 0] * sheet.size
+    place = place if np.corrcoef(place, along)[0, 1] > 0 else place.max() - place
+    assert np.abs(place - along - np.median(place - along)).max() < 1  # the layers are 6 apart and more

@@ -47,7 +47,7 @@ class AtParameters(AbstractErrors):
 class LocalFeet(AbstractErrors):
     """Errors at local foot points, found from the parameters that the fit ended with.
 
-    Another part of the surface may be nearer.
+    Another part of the surface may be nearer. Where none is found, the whole surface is searched.
 
     Examples
     --------
@@ -58,10 +58,23 @@ class LocalFeet(AbstractErrors):
 
     def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
         """The known ones if they are feet, or else the local feet found from them."""
-        if at_feet:
-            return known
-        found = closest_point(surface, points, start=(known[0], known[1]))
-        return found.u, found.v, found.distance, found.converged
+        if not at_feet:
+            found = closest_point(surface, points, start=(known[0], known[1]))
+            known = found.u, found.v, found.distance, found.converged
+        return _searched_again(surface, points, known) if is_concrete(surface, points, known) else known
+
+
+def _searched_again(surface: BSplineSurface, points: Any, known: Feet) -> Feet:
+    """With the nearest feet on the whole surface where local ones have not converged and are farther."""
+    lost = np.flatnonzero(~np.asarray(known[3]))
+    if not len(lost):
+        return known
+    found = closest_point(surface, np.asarray(points)[lost])
+    nearer = np.asarray(found.distance) < np.asarray(known[2])[lost]
+    arrays = [np.array(x) for x in known]
+    for array, new in zip(arrays, (found.u, found.v, found.distance, found.converged), strict=True):
+        array[lost[nearer]] = np.asarray(new)[nearer]
+    return arrays[0], arrays[1], arrays[2], arrays[3]
 
 
 class GlobalFeet(AbstractErrors):

@@ -82,9 +82,11 @@ def fit_points(
     Fit
         Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
         `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
-        `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
-        that of the mesh. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left
-        out have errors as well, but do not count; where they are not finite u, v and errors are NaN.
+        `feet_on_border`: points on the sheet whose foot is on the border of the domain; `sheet_area`, that of
+        the mesh; and `projected_area`, that of the mesh with its vertices moved to their feet. Noise makes
+        the mesh rough and the first of these areas too large; `trimmed.area()` is near the second.
+        `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left out have errors
+        as well, but do not count; where they are not finite u, v and errors are NaN.
 
     Raises
     ------
@@ -115,7 +117,8 @@ def fit_points(
     survey of a town from the air, are laid out by their principal plane instead, the mesh over medians of
     their heights. Fails where two sheets are nearer to each other than their points, for closed surfaces,
     tubes and several pieces, and where noise is coarser than the points are dense and the cloud is not level.
-    Of more than 30,000 points an even choice makes the mesh, and faces are not used.
+    Of more than 30,000 points an even choice makes the mesh; given faces then say which of these are
+    neighbours, by distances along their edges.
 
     With a `net` the fit is differentiable in points, weights and numbers of the method, as `approximate` is.
     The base surface counts as constant then: inside, where it starts from does not matter to where the fit

@@ -15,7 +15,7 @@ from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
-from jaxfit._scan import Layout, Sheet, sheet_of, trim_loops
+from jaxfit._scan import Layout, Sheet, node_feet, projected_area, sheet_of, trim_loops
 from jaxfit._trimmed import TrimmedSurface
 
 Order = tuple[int, int]
@@ -66,7 +66,8 @@ def _for_all(fit: Fit, finite: np.ndarray) -> Fit:
 def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
     """With the rim and the holes in the parameters of its surface, and what was found on the way."""
     feet = np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1)[sheet.number]
-    loops = trim_loops(fit.surface, sheet, layout.sides, feet)
+    nodes = node_feet(fit.surface, sheet, feet)
+    loops = trim_loops(fit.surface, sheet, layout.sides, nodes)
     domain = [tuple(float(x) for x in limits) for limits in fit.surface.domain]
     on_border = np.any([np.isin(x, limits) for x, limits in zip(feet.T, domain, strict=True)], axis=0)
     found = {
@@ -74,6 +75,7 @@ def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
         "holes": len(loops) - 1,
         "hole_length": sheet.hole_length,
         "sheet_area": sheet.area,
+        "projected_area": projected_area(fit.surface, sheet, nodes),
         "feet_on_border": int((on_border & sheet.on_sheet).sum()),
     }
     return dataclasses.replace(fit, stats=fit.stats | found, trimmed=TrimmedSurface(fit.surface, loops))

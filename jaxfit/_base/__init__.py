@@ -17,8 +17,8 @@ from jaxfit._base._default_net import default_size as default_size
 from jaxfit._base._default_net import net_of_ratio as net_of_ratio
 from jaxfit._base._default_net import net_of_size as net_of_size
 from jaxfit._base._delaunay_stars import Stars as Stars
-from jaxfit._base._delaunay_stars import point_normals as point_normals
 from jaxfit._base._delaunay_stars import stars as stars
+from jaxfit._base._delaunay_stars import supported_planes as supported_planes
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._base._point_normals import oriented, principal_axes
+from jaxfit._base._point_normals import oriented, principal_axes, supported_axes
 
 TIES = 1e-9  # neighbours this much farther (relatively) than the last one still belong: ties are ties
 SPARE = 16  # of which there may be so many
@@ -33,7 +33,7 @@ class Stars(NamedTuple):
     angle: Float[Any, "points width"]  # from each to the next, at most 2 pi
 
 
-class _Planes(NamedTuple):
+class Planes(NamedTuple):
     """Points with the axes of their tangent planes, and in space normals to one side."""
 
     points: np.ndarray  # (points, d)
@@ -41,14 +41,15 @@ class _Planes(NamedTuple):
     normals: np.ndarray | None  # (points, 3)
 
 
-def stars(points: Float[Any, "points d"], count: int, fixed: int = 0) -> Stars:
-    """The stars among about `count` neighbours, d >= 2; no two points may coincide.
+def stars(points: Float[Any, "points d"], count: int, fixed: int = 0, planes: Planes | None = None) -> Stars:
+    """The stars among about `count` neighbours, d >= 2, in given planes or in those of as many neighbours; no
+    two points may coincide.
 
     Points with a wide gap, except the first `fixed` ones, get a second search among all points that have one:
     the points on the rim of a hole are then neighbours across it. Otherwise the hole would grow.
     """
     members, filled = neighbourhoods(points, count)
-    planes = _planes(points, members, filled)
+    planes = _planes(points, members, filled) if planes is None else planes
     star = _stars_among(planes, np.arange(len(points)), members, filled)
     gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
     rows = gaping[gaping >= fixed]
@@ -60,7 +61,7 @@ def stars(points: Float[Any, "points d"], count: int, fixed: int = 0) -> Stars:
     return star
 
 
-def _stars_among(planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
+def _stars_among(planes: Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
     """The stars of the points `rows` among given ones."""
     plane = _in_tangent_planes(planes, rows, members, filled)
     angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
@@ -131,19 +132,26 @@ def neighbourhoods(
     return members, filled
 
 
-def _planes(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> _Planes:
+def _planes(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Planes:
+    unit, weight = _weighted(points, members, filled)
+    axes = principal_axes(unit, weight)
+    normals = oriented(axes[:, :, 0], unit, members, filled) if points.shape[1] == 3 else None
+    return Planes(points, axes[:, :, -2:], normals)
+
+
+def _weighted(points: np.ndarray, members: np.ndarray, filled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions of the neighbours, and by how much each counts: less the farther it is."""
     far, unit = _directions(points, np.arange(len(points)), members, filled)
     nearest = np.where(filled, far, np.inf).min(axis=1, keepdims=True)
-    axes = principal_axes(unit, np.where(filled, nearest / far, 0.0))
-    normals = oriented(axes[:, :, 0], unit, members, filled) if points.shape[1] == 3 else None
-    return _Planes(points, axes[:, :, -2:], normals)
+    return unit, np.where(filled, nearest / far, 0.0)
 
 
-def point_normals(points: Float[Any, "points 3"], count: int) -> Float[Any, "points 3"]:
-    """Unit normals of the planes through about `count` neighbours, all to one side of the surface."""
-    normals = _planes(points, *neighbourhoods(points, count)).normals
-    assert normals is not None
-    return normals
+def supported_planes(points: Float[Any, "points 3"], count: int) -> Planes:
+    """Tangent planes by about `count` neighbours, of which some may be on another sheet that is as near."""
+    members, filled = neighbourhoods(points, count)
+    unit, weight = _weighted(points, members, filled)
+    axes = supported_axes(unit, weight, members, filled)
+    return Planes(points, axes[:, :, -2:], oriented(axes[:, :, 0], unit, members, filled))
 
 
 def _directions(
@@ -156,7 +164,7 @@ def _directions(
 
 
 def _in_tangent_planes(
-    planes: _Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray
+    planes: Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray
 ) -> np.ndarray:
     """Neighbours in the tangent plane: the direction is projected, the distance kept or lengthened.
 

@@ -8,19 +8,57 @@ from jaxtyping import Bool, Float, Int
 PLANES = 3  # times the plane is laid; each time, steps out of the last one count less
 
 
+CERTAIN = 0.9  # of the neighbours flat in the plane of a point: no other plane is tried
+CANDIDATES = 16  # neighbours whose planes are tried otherwise
+TILTED = np.cos(np.deg2rad(60.0))  # largest cosine with its own plane; less of a tilt may be noise or a bend
+FLATNESS = 8  # power of the squared cosine of its slope by which a neighbour counts as flat in a plane
+
+
 def principal_axes(
-    unit: Float[Any, "points width d"], weight: Float[Any, "points width"]
+    unit: Float[Any, "points width d"], weight: Float[Any, "points width"], cosine: Any = 1.0
 ) -> Float[Any, "points d d"]:
     """Principal axes of the weighted unit directions to the neighbours, as columns, the normal first.
 
-    Unit, so that a dense side does not outweigh a thin one by its distances.
+    Unit, so that a dense side does not outweigh a thin one by its distances. `cosine` is by how much each
+    direction counts at first, its squared cosine with the plane, squared.
     """
-    cosine = 1.0
     for _ in range(PLANES):
         covariance = np.swapaxes(unit * (weight * cosine)[..., None], 1, 2) @ unit
         axes = np.linalg.eigh(covariance)[1]
         cosine = np.sum((unit @ axes[:, :, -2:]) ** 2, axis=2) ** 2
     return axes
+
+
+def supported_axes(
+    unit: Float[Any, "points width 3"],
+    weight: Float[Any, "points width"],
+    members: Int[Any, "points width"],
+    filled: Bool[Any, "points width"],
+) -> Float[Any, "points 3 3"]:
+    """The principal axes, found again from the plane of that neighbour in which most others lie flat.
+
+    Where another sheet is as near as the next points, the plane of all of them may lie across both.
+    """
+    axes = principal_axes(unit, weight)
+    normals = axes[:, :, 0]
+    flat = _flat(unit, weight, normals)
+    rows = np.flatnonzero(flat < CERTAIN * weight.sum(axis=1))
+    unit, weight, flat, own = unit[rows], weight[rows], flat[rows], normals[rows]
+    found, best = np.zeros(len(rows), bool), own
+    for k in range(min(CANDIDATES, members.shape[1])):
+        normal = normals[members[rows, k]]
+        other = np.where(filled[rows, k], _flat(unit, weight, normal), 0.0)
+        better = (other > flat) & (np.abs(np.sum(normal * own, axis=1)) < TILTED)
+        found |= better
+        flat, best = np.where(better, other, flat), np.where(better[:, None], normal, best)
+    cosine = (1 - np.sum(unit * best[:, None], axis=2) ** 2) ** 2
+    axes[rows[found]] = principal_axes(unit[found], weight[found], cosine[found])
+    return axes
+
+
+def _flat(unit: np.ndarray, weight: np.ndarray, normals: np.ndarray) -> Float[Any, " points"]:
+    """How many neighbours, by weight, lie flat in the planes with these normals."""
+    return np.sum(weight * (1 - np.sum(unit * normals[:, None], axis=2) ** 2) ** FLATNESS, axis=1)
 
 
 def oriented(

@@ -46,6 +46,7 @@ class Fit(eqx.Module):
         its tolerances with a surface that folds; the sentence then says so.
     regularity : Regularity
         Number and places of folds, parameter lines and energies of the surface, measured on first use.
+        `folds` is their number, inside the loops where the surface is trimmed.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
         foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
@@ -106,6 +107,14 @@ class Fit(eqx.Module):
         and ValueError for a batch, of which `jax.tree.map(lambda x: x[i], fit)` is a fit.
         """
         return regularity(self.surface)
+
+    @property
+    def folds(self) -> int:
+        """The folds that `regularity` finds: inside the loops of `trimmed`, or where there are none, all."""
+        places = self.regularity.fold_parameters
+        if self.trimmed is None or not len(places):
+            return len(places)
+        return int(np.asarray(self.trimmed.contains(*places.T)).sum())
 
     @property
     def message(self) -> str:

@@ -48,7 +48,7 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
     without = {} if not found.degenerate else {"no normal": f"at {found.degenerate:,} of {_samples(found)}"}
     least, largest = found.line_ratios
     return {
-        "folds": f"at {_places(found)}{_largest_group(found)}" if found.folds else "none",
+        "folds": _said_folds(fit),
         **without,
         "parameter lines": f"at least {np.degrees(found.smallest_angle):.3g} degrees apart, "
         f"ratio {least:.2g} to {largest:.2g}",
@@ -75,7 +75,7 @@ def _cleaning_facts(fit: Any) -> dict[str, str]:
 
 def _trim_facts(fit: Any) -> dict[str, str]:
     """The loops, and the errors of the points inside them."""
-    trimmed = getattr(fit, "trimmed", None)
+    trimmed = fit.trimmed
     if trimmed is None or not _is_finite(fit):
         return {}
     holes = {0: "no hole", 1: "one hole"}.get(trimmed.holes, f"{trimmed.holes:,} holes")
@@ -84,19 +84,17 @@ def _trim_facts(fit: Any) -> dict[str, str]:
     if inside.any():
         kept = errors[inside]
         within += f", average error {kept.mean():.4g} %, maximum {kept.max():.4g} %"
-    if fit.regularity.folds:
-        within += f"; {_folds_inside(fit):,} folds"
     outer = len(trimmed.loops[0])
     return {"loops": f"the outer one with {outer:,} vertices, {holes}", "inside the loops": within}
 
 
-def _folds_inside(fit: Any) -> int:
-    """Folds of the surface; of a trimmed one those inside its loops, for the others are cut away."""
-    places = fit.regularity.fold_parameters
-    trimmed = getattr(fit, "trimmed", None)
-    if trimmed is None or not len(places):
-        return len(places)
-    return int(np.asarray(trimmed.contains(*places.T)).sum())
+def _said_folds(fit: Any) -> str:
+    found: Regularity = fit.regularity
+    if not found.folds:
+        return "none"
+    if fit.trimmed is not None:
+        return f"{fit.folds or 'none'} inside the loops, {found.folds - fit.folds:,} cut away"
+    return f"at {_places(found)}{_largest_group(found)}"
 
 
 def _samples(found: Regularity) -> str:
@@ -122,10 +120,10 @@ def with_folds(fit: Any, sentence: str) -> str:
             f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
             "this net that does not fold; insert knots, or look whether they lie on another sheet."
         )
-    if not (is_single(fit) and _is_finite(fit) and _folds_inside(fit)):
+    if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
-    within = f", {_folds_inside(fit):,} inside its loops" if getattr(fit, "trimmed", None) is not None else ""
-    folds = f"the surface folds at {_places(fit.regularity)}{within}: {_REMEDIES['method' not in fit.stats]}."
+    where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
+    folds = f"the surface folds at {where}: {_REMEDIES['method' not in fit.stats]}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"

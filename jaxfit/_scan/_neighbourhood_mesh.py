@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfit._base import Stars, point_normals, stars
+from jaxfit._base import Stars, stars, supported_planes
 from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
-NEIGHBOURS = 16  # of a point, among which its star is searched
+PLANE_NEIGHBOURS = 16  # of a point, that make its tangent plane
+NEIGHBOURS = 24  # among which its star is searched: near another sheet some are on that
+ALIKE = 0.5  # least cosine between normals of corners that are surely on one sheet
 WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
 
 
@@ -19,15 +21,19 @@ def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_vote
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
     come first, then those in at least `least_votes` that fit in between, the shortest first. On an exact grid
     that is bent both halves of a square may be in one star each; among noise such triangles make bridges.
+    Triangles between corners whose normals differ much come last: they may join sheets that face each other.
     """
-    star = stars(points, NEIGHBOURS, fixed=len(points))
-    normals = point_normals(points, NEIGHBOURS)
+    planes = supported_planes(points, PLANE_NEIGHBOURS)
+    star = stars(points, NEIGHBOURS, fixed=len(points), planes=planes)
     faces, votes = _candidates(star)
     longest = longest_edges(points, faces)
     chosen = (longest <= length) & (votes >= least_votes)
     faces, votes, longest = faces[chosen], votes[chosen], longest[chosen]
-    faces = faces[np.lexsort((longest, -votes))]
-    return manifold(_oriented(points, normals, faces))
+    assert planes.normals is not None
+    corners = planes.normals[faces]
+    unlike = (np.sum(corners * np.roll(corners, 1, axis=1), axis=2) < ALIKE).any(axis=1)
+    faces = faces[np.lexsort((longest, -votes, unlike))]
+    return manifold(_oriented(points, planes.normals, faces))
 
 
 def _candidates(star: Stars) -> tuple[Faces, Int[np.ndarray, " faces"]]:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfit._scan._manifold import Faces
 
@@ -17,8 +17,10 @@ def carried_places(
     nodes: Float[Any, "nodes 3"],
     faces: Faces,
     flat: Float[Any, "nodes 2"],
+    known: Int[Any, " points"] | None = None,
 ) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
-    """Places in the plane of all points, and their distances from the nearest nodes.
+    """Places in the plane of all points, and their distances from the nearest nodes, which may be `known`: -1
+    where they are not.
 
     A step out of the tangent plane counts more: where sheets face each other closely, the nearest node may be
     on the wrong one.
@@ -29,7 +31,9 @@ def carried_places(
     steps = points[:, None] - nodes[near]
     above = np.abs(np.sum(steps * node_normals(nodes, faces)[near], axis=2))
     best = np.argmin(away + ACROSS * above, axis=1)[:, None]
-    away, nearest = (np.take_along_axis(x, best, axis=1)[:, 0] for x in (away, near))
+    nearest = np.take_along_axis(near, best, axis=1)[:, 0]
+    nearest = nearest if known is None else np.where(known >= 0, known, nearest)
+    away = np.linalg.norm(points - nodes[nearest], axis=1)
     step = np.einsum("pij,pj->pi", _gradients(nodes, faces, flat)[nearest], points - nodes[nearest])
     edge = np.median(np.linalg.norm(flat[faces[:, 0]] - flat[faces[:, 1]], axis=1))
     length = np.linalg.norm(step, axis=1, keepdims=True)

@@ -128,7 +128,7 @@ def _steps(loop: np.ndarray) -> np.ndarray:
 
 def _given_faces(points: np.ndarray, clean: Cleaned, faces: Faces | None) -> Faces | None:
     """The faces between the kept points; a duplicate is the point that it repeats."""
-    if faces is None or len(clean.kept) > MOST_NODES:
+    if faces is None:
         return None
     _, inverse = np.unique(points, axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxfit._progress_line import doing
+from jaxfit._scan._coarse_mesh import coarse_faces
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
@@ -34,15 +35,10 @@ class SheetMesh(NamedTuple):
 
 def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple[SheetMesh, float]:
     """The mesh of the cloud, and the length that decided what is a hole."""
+    chosen = np.arange(len(cloud)) if len(cloud) <= MOST_NODES else _even_choice(cloud)
+    nodes = cloud[chosen]
     if faces is not None:
-        longest = longest_edges(cloud, faces)
-        if length is not None:
-            faces = faces[longest <= length]
-        whole = largest_piece(cloud, faces)
-        whole = whole if length is None else filled_holes(cloud, whole, length)
-        reach = float(longest.max()) if length is None else length
-        return _laid_out(cloud, cloud, whole, faces, reach), reach
-    nodes = cloud if len(cloud) <= MOST_NODES else _even_choice(cloud)
+        return _from_faces(cloud, nodes, faces, chosen, length)
     reach = _hole_length(nodes) if length is None else length
     found = neighbourhood_mesh(nodes, reach)
     if (covered := _coverage(nodes, found)) < COVERED:
@@ -60,23 +56,49 @@ def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> 
     return _laid_out(cloud, nodes, whole, found, reach), reach
 
 
+def _from_faces(
+    cloud: np.ndarray, nodes: np.ndarray, faces: Faces, chosen: np.ndarray, length: float | None
+) -> tuple[SheetMesh, float]:
+    """The mesh of given faces, with nodes chosen where there are too many points."""
+    if length is not None:
+        faces = faces[longest_edges(cloud, faces) <= length]
+    closed, region = length, None
+    if len(nodes) < len(cloud):
+        faces, region = coarse_faces(cloud, faces, chosen)
+        closed = max(length or 0.0, HOLE_SPACINGS * float(np.median(longest_edges(nodes, faces))))
+    whole = largest_piece(nodes, faces)
+    whole = whole if closed is None else filled_holes(nodes, whole, closed)
+    reach = length or float(longest_edges(nodes, whole).max())
+    return _laid_out(cloud, nodes, whole, faces, reach, region), reach
+
+
 def _coverage(nodes: np.ndarray, faces: Faces) -> float:
     """Triangles of the largest piece, over the number of a mesh with all nodes."""
     return float(np.bincount(pieces(faces)).max()) / (2 * len(nodes)) if len(faces) else 0.0
 
 
-def _laid_out(cloud: np.ndarray, nodes: np.ndarray, faces: Faces, before: Faces, length: float) -> SheetMesh:
-    """The largest piece of a mesh of nodes in space; all points get places from the nearest node.
+def _laid_out(
+    cloud: np.ndarray,
+    nodes: np.ndarray,
+    faces: Faces,
+    before: Faces,
+    length: float,
+    region: np.ndarray | None = None,
+) -> SheetMesh:
+    """The largest piece of a mesh of nodes in space; all points get places from the nearest node, or from the
+    node of their `region`.
 
     Points of another piece of the mesh `before` are off the sheet, unless that piece is next to it.
     """
     used = in_use(faces, len(nodes))
     stray = _next_to(cloud, nodes, _separate(nodes, before, used, GAP * length), used)
-    nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
+    number = np.where(used, np.cumsum(used) - 1, -1)
+    known = None if region is None else np.where(region >= 0, number[region], -1)
+    nodes, faces = nodes[used], number[faces]
     loops = sheet_loops(nodes, faces)
     doing(f"laying {len(faces):,} triangles out flat")
     flat = flat_places(nodes, faces, loops)
-    places, away = carried_places(cloud, nodes, faces, flat)
+    places, away = carried_places(cloud, nodes, faces, flat, known)
     return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
 
 
@@ -127,11 +149,11 @@ def _hole_length(nodes: np.ndarray) -> float:
 
 
 def _even_choice(cloud: np.ndarray) -> np.ndarray:
-    """About `MOST_NODES` of the points, one from each cube that has any."""
+    """Numbers of about `MOST_NODES` points, one from each cube that has any."""
     size = 1.0 / np.sqrt(MOST_NODES)
     while True:
         cell = np.floor(cloud / size).astype(int)
         _, first = np.unique(cell, axis=0, return_index=True)
         if len(first) <= MOST_NODES:
-            return cloud[np.sort(first)]
+            return np.sort(first)
         size *= max(np.sqrt(len(first) / MOST_NODES), 1.02)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxfit._closest import closest_point
 from jaxfit._scan._extras import import_shapely
-from jaxfit._scan._manifold import Faces
+from jaxfit._scan._manifold import Faces, areas
 from jaxfit._scan._sheet import Sheet
 from jaxfit._splines import BSplineSurface
 
@@ -21,7 +21,7 @@ Loop = Float[np.ndarray, "vertices 2"]
 
 
 def trim_loops(
-    surface: BSplineSurface, sheet: Sheet, sides: Float[Any, "2"], feet: Float[Any, "kept 2"]
+    surface: BSplineSurface, sheet: Sheet, sides: Float[Any, "2"], feet: Float[Any, "nodes 2"]
 ) -> tuple[Loop, ...]:
     """Closed polylines in (u, v), the rim first and counter-clockwise, holes clockwise.
 
@@ -32,7 +32,7 @@ def trim_loops(
     shapely = import_shapely()
     low, high = np.asarray(surface.domain, float).T
     scale = sides / (high - low)  # (u, v) to about the lengths of the sheet
-    region = _union((_node_feet(surface, sheet, feet) - low) * scale, sheet.faces)
+    region = _union((feet - low) * scale, sheet.faces)
     reach, least = SMOOTHED * sheet.spacing, STRAIGHT * sheet.spacing
     region = _largest(region.buffer(reach).buffer(-reach).simplify(least).buffer(least + sheet.outset))
     region = _largest(region.intersection(shapely.box(0.0, 0.0, *sides)))
@@ -53,7 +53,17 @@ def _union(places: Float[Any, "nodes 2"], faces: Faces) -> Any:
     return _largest(shapely.union_all(triangles[area > LEAST_AREA * area.mean()]))
 
 
-def _node_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> Loop:
+def projected_area(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "nodes 2"]) -> float:
+    """Of the mesh, its nodes moved to their feet: without the roughness that noise gives the mesh."""
+    from scipy.interpolate import NdBSpline
+
+    arrays = surface.knots_u, surface.knots_v, surface.control_points
+    knots_u, knots_v, net = (np.asarray(x, float) for x in arrays)
+    spline = NdBSpline((knots_u, knots_v), net, tuple(order - 1 for order in surface.order))
+    return float(areas(spline(feet), sheet.faces).sum())
+
+
+def node_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> Loop:
     """Of the nodes of the mesh, found from the feet of the points next to them."""
     from scipy.spatial import cKDTree
 
