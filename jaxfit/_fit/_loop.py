@@ -23,6 +23,7 @@ from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._varying import as_varying, as_varying_as
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
@@ -107,6 +108,7 @@ def _iterate(
     def unfinished(loop: LoopState) -> Array:
         return (loop.code == running) & (loop.next.step <= until)
 
+    loop = as_varying(loop, numbers, problem, loop)
     loop = lax.while_loop(unfinished, partial(_one_iteration, method, problem), loop)
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
     last, stats = method.postprocess(problem, loop.current, early)
@@ -117,7 +119,7 @@ def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: Loop
     """Measure, accept, record, decide, move."""
     old, new = loop.current, loop.next
     projection, state = method.measure(problem, new, loop.exact)
-    new = Iterate(new.surface, projection, state, new.step)
+    new = as_varying_as(Iterate(new.surface, projection, state, new.step), new)
     new = lax.cond(new.step > 0, lambda: method.accept(problem, old, new), lambda: new)
     return record_and_move(method, problem, loop, new, problem.summarise(new.projection, old.projection))
 
@@ -137,9 +139,9 @@ def record_and_move(
         lambda: method.move(problem, new, history),
         lambda: (new, history),
     )
-    good = LoopState(new, following, history, code, again)
+    good = as_varying_as(LoopState(new, following, history, code, again), loop)
     # A surface that is not finite, or far worse than the first, is discarded.
-    kept = eqx.tree_at(lambda x: x.code, loop, code)
+    kept = eqx.tree_at(lambda x: x.code, loop, good.code)
     return lax.cond((code == diverged) & (new.step > 0), lambda: kept, lambda: good)
 
 
