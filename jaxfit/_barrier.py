@@ -22,9 +22,7 @@ def materialise(always: Array, function: Callable[..., Any], *args: Any) -> Any:
     def never(*args: Any) -> Any:
         # Handing on an argument needs no code; zeros would be a kernel each.
         some = {_kind(x): x for x in jax.tree.leaves(args)}
-        return jax.tree.map(
-            lambda x: some.get(_kind(x), as_varying(jnp.zeros(x.shape, x.dtype), x)), shapes
-        )
+        return jax.tree.map(lambda x: some.get(_kind(x), as_varying(jnp.zeros(x.shape, x.dtype), x)), shapes)
 
     return lax.cond(always, function, never, *args)
 

@@ -7,6 +7,8 @@ from jax.typing import ArrayLike
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._approximation._orthogonal import OrthogonalDistance
+from jaxfit._approximation._sharded_fit import fit_sharded_cloud
+from jaxfit._approximation._shards import divided_over
 from jaxfit._checks import eager_where_concrete
 from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._loop import Progress
@@ -116,7 +118,8 @@ def approximate(
         "errors": errors,
         "adjoint": adjoint,
     }
-    return fit_cloud(points, base, default_method(method), request)
+    fit = fit_cloud if divided_over(points) is None else fit_sharded_cloud
+    return fit(points, base, default_method(method), request)
 
 
 def default_method(method: AbstractIterativeMethod | None) -> AbstractIterativeMethod:
