@@ -2,17 +2,11 @@
 
 import json
 import re
+import sys
 
 import jax
 import numpy as np
-from jaxtyping import install_import_hook
-
-install_import_hook("jaxfit", "beartype.beartype")
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_disable_most_optimizations", True)
-
-from helpers import wavy_cloud
+from helpers import noisy_sheet
 
 import jaxfit as jf
 from jaxfit._approximation import _sharded_fit
@@ -25,9 +19,7 @@ METHODS = {
 }
 OPTIONS = dict(tol_average=0.0, max_steps=5)
 MESH = jax.make_mesh((CLOUDS,), ("points",))
-ALL, EDGES = wavy_cloud(COUNT)
-ALL = ALL + 1e-3 * np.random.default_rng(1).normal(size=ALL.shape)
-BASE = jf.base_surface(jf.Boundary(**EDGES), net=NET)
+ALL, BASE = noisy_sheet(COUNT, NET)
 RUN = _sharded_fit.run_on_devices
 
 
@@ -44,7 +36,7 @@ def collectives(text):
         yield int(sum(sizes)), "while/body" in rest
 
 
-def on_all_devices(method, rows=None):
+def on_all_devices(method):
     """The fit on all devices, and what its program sends."""
     calls = []
     _sharded_fit.run_on_devices = lambda *args: calls.append(args) or RUN(*args)
@@ -98,7 +90,7 @@ def main():
         shared(method).lower(clouds_there)  # JAX checks what varies from device to device
     nets = np.asarray(shared(METHODS["standard"])(clouds_there))
     found["batch"] = apart(nets, jax.jit(fits_of(METHODS["standard"]))(clouds))
-    print(json.dumps(found))
+    sys.stdout.write(json.dumps(found) + "\n")
 
 
 if __name__ == "__main__":

@@ -5,13 +5,7 @@ import sys
 
 import jax
 import numpy as np
-
-PROCESS, ADDRESS = int(sys.argv[1]), sys.argv[2]
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_disable_most_optimizations", True)
-jax.distributed.initialize(ADDRESS, num_processes=2, process_id=PROCESS)
-
-from helpers import wavy_cloud
+from helpers import noisy_sheet
 
 import jaxfit as jf
 
@@ -21,10 +15,10 @@ METHODS = (jf.StandardApproximation(), jf.OrthogonalDistance())
 
 def main():
     """The same fit by both processes, each with its own points, and by this one alone."""
-    cloud, edges = wavy_cloud(2500)
-    cloud = cloud + 1e-3 * np.random.default_rng(1).normal(size=cloud.shape)
-    base = jf.base_surface(jf.Boundary(**edges), net=(8, 7))
-    own = cloud[:FIRST] if PROCESS == 0 else cloud[FIRST:]
+    process, address = int(sys.argv[1]), sys.argv[2]
+    jax.distributed.initialize(address, num_processes=2, process_id=process)
+    cloud, base = noisy_sheet(2500, (8, 7))
+    own = cloud[:FIRST] if process == 0 else cloud[FIRST:]
     points, weights = jf.shard_points(own, jax.make_mesh((jax.device_count(),), ("points",)))
     found = []
     for method in METHODS:
@@ -38,8 +32,10 @@ def main():
             (fit.history.average, one.history.average),
         ]
         apart = max(float(np.abs(np.asarray(x) - np.asarray(y)).max()) for x, y in pairs)
-        found.append({"apart": apart, "rows": fit.errors.shape[0], "devices": len(fit.errors.sharding.device_set)})
-    print(json.dumps(found))
+        found.append(
+            {"apart": apart, "rows": fit.errors.shape[0], "devices": len(fit.errors.sharding.device_set)}
+        )
+    sys.stdout.write(json.dumps(found) + "\n")
 
 
 if __name__ == "__main__":

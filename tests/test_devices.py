@@ -6,12 +6,8 @@ import socket
 import subprocess
 import sys
 
-import jax
-import numpy as np
 import pytest
-from helpers import CHECKOUT, wavy_cloud
-
-import jaxfit as jf
+from helpers import CHECKOUT
 
 TESTS = CHECKOUT / "tests"
 SECONDS = 600  # a machine that others use, too
@@ -22,7 +18,9 @@ MOST_REDUCTIONS = 3  # in an iteration
 def environment(devices):
     paths = os.pathsep.join(map(str, (CHECKOUT, TESTS)))
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    return {**os.environ, "XLA_FLAGS": flags.strip(), "PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
+    session = {"JAX_ENABLE_X64": "1", "JAX_NUMPY_RANK_PROMOTION": "raise", "JAX_PLATFORMS": "cpu"}
+    session |= {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": flags.strip(), "PYTHONPATH": paths}
+    return {**os.environ, **session}
 
 
 @pytest.fixture(scope="module")
