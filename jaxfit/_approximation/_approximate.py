@@ -95,6 +95,14 @@ def approximate(
     the boundary that they come from. Knots have none. `ImplicitAdjoint` says when `stats["stationarity"]`
     permits to trust a derivative; inside `jit` that is NaN unless the fit is differentiated there.
 
+    Points divided among the devices of a mesh (`shard_points`, also of several processes) are fitted where
+    they are, by the three methods of this library: each device has the rows of its own points, and one to
+    three sums of the size of the net go between devices in an iteration. u, v and errors stay divided.
+    Closest points on the first and the last surface are searched by each process for its own points. Refused
+    there: `adjoint`, `progress`, and what looks at all points together (knot insertion, local mode, a loss
+    without a scale, a chosen lambda). Inside `jit` a divided cloud is gathered; inside your own
+    `jax.shard_map` each device fits the clouds that it has.
+
     Examples
     --------
     >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
