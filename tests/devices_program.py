@@ -66,6 +66,25 @@ def compared(method):
     }
 
 
+REFUSED = {
+    "adjoint": dict(adjoint=jf.ImplicitAdjoint()),
+    "progress": dict(progress=lambda *_: None),
+    "insertion": dict(method=jf.OrthogonalDistance(insertion=jf.KnotInsertion())),
+    "loss": dict(method=jf.GeometricApproximation(loss=jf.Tukey())),
+    "weights": dict(weights=-np.ones(COUNT + 7)),
+    "points": dict(weights=np.full(COUNT + 7, np.nan)),
+}
+
+
+def refusal(options):
+    """The sentence that a fit is refused with."""
+    points, weights = jf.shard_points(ALL, MESH)
+    try:
+        jf.approximate(points, BASE, **{"weights": weights, **options})
+    except ValueError as error:
+        return str(error)
+
+
 def fits_of(method):
     """A function of clouds (clouds, points, 3): their nets, for a user's own `shard_map`."""
 
@@ -83,6 +102,7 @@ def shared(method):
 def main():
     """Everything, as one line."""
     found = {name: compared(method) for name, method in METHODS.items()}
+    found["refused"] = {name: refusal(options) for name, options in REFUSED.items()}
     clouds = ALL[: CLOUDS * 300].reshape(CLOUDS, 300, 3)
     where = jax.sharding.NamedSharding(MESH, jax.sharding.PartitionSpec("points"))
     clouds_there = jax.device_put(clouds, where)

@@ -59,6 +59,21 @@ def test_each_device_fits_its_own_clouds_in_a_shard_map_of_the_user(eight):
     assert eight["batch"] < 1e-12
 
 
+SENTENCES = {
+    "adjoint": "adjoint must be None where points are divided among devices; ",
+    "progress": "progress must be None where points are divided among devices; ",
+    "insertion": "the method's insertion must be None where points are divided among devices, but is ",
+    "loss": "the method's loss must be Tukey(scale) where points are divided among devices, but is ",
+    "weights": "weights must not be negative and not all zero; ",
+    "points": "points and weights must be finite, but 20008 points have an entry that is not; ",
+}
+
+
+@pytest.mark.parametrize("name", SENTENCES)
+def test_what_needs_all_points_together_is_refused_in_a_sentence(eight, name):
+    assert eight["refused"][name].startswith(SENTENCES[name])
+
+
 def test_two_processes_have_the_fit_of_one():
     with socket.socket() as free:
         free.bind(("localhost", 0))

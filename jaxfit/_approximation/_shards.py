@@ -41,8 +41,8 @@ def shard_points(
     --------
     >>> mesh = jax.make_mesh((1,), ("points",))
     >>> points, weights = jf.shard_points(np.random.default_rng(0).random((50, 3)), mesh)
-    >>> points.shape, weights.shape, points.sharding.spec
-    ((50, 3), (50,), PartitionSpec('points',))
+    >>> points.shape, weights.shape, tuple(points.sharding.spec)
+    ((50, 3), (50,), ('points',))
     """
     check_kind("mesh", mesh, Mesh, 'jax.make_mesh((jax.device_count(),), ("points",))')
     cloud = np.asarray(as_points("points", points))
