@@ -73,10 +73,8 @@ def _scaled(report, options, sizes, what, row):
     for name, times in lines.items():
         last = len(sizes) // 2
         slopes = [_slope(sizes[part], times[part]) for part in (slice(None), slice(last, None))]
-        report.remark(
-            f"{name}: the time of all cores in a pass grows like {what}^{slopes[0]:.2f}, from {sizes[last]:,} "
-            f"on like {what}^{slopes[1]:.2f}."
-        )
+        growth = f"{what}^{slopes[0]:.2f}, from {sizes[last]:,} on like {what}^{slopes[1]:.2f}"
+        report.remark(f"{name}: the time of all cores in a pass grows like {growth}.")
     if options.pictures:
         _draw(options.pictures / f"scaling_{what}.png", sizes, lines, what)
 
