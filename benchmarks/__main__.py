@@ -21,13 +21,14 @@ jax.config.update("jax_enable_x64", True)
 SUITES = {
     "paper": "Tables 1 to 5 and Figures 1, 2, 4b, 7, 8 and 10 of the paper",
     "peers": "beside SciPy, CHOLMOD, geomdl, splinepy, splipy and Open CASCADE, on the same arrays",
-    "scaling": "time and error by the number of points and of control points",
+    "scaling": "time of a pass and error by the number of points and of control points",
     "compile": "first and later calls, each in a process of its own",
     "gradients": "time of a gradient beside the fit, and beside central differences",
     "batch": "many fits: a loop, `jax.lax.map`, and `map_fits` with threads and processes",
 }
 STUDIES = {
     "bases": "base surfaces of scans",
+    "devices": "a cloud divided among devices, and among processes",
     "closest_point": "closest points: time a point, and how many are wrong",
     "growing_net": "the net chosen for a tolerance, and noise",
     "local": "local mode",

@@ -25,6 +25,7 @@ from jaxfit._approximation import StandardApproximation as StandardApproximation
 from jaxfit._approximation import Tukey as Tukey
 from jaxfit._approximation import approximate as approximate
 from jaxfit._approximation import fit_points as fit_points
+from jaxfit._approximation import shard_points as shard_points
 from jaxfit._base import Boundary as Boundary
 from jaxfit._base import Coons as Coons
 from jaxfit._base import DynamicBaseSurface as DynamicBaseSurface

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from jaxfit._varying import as_varying, varying_axes
+
 
 def materialise(always: Array, function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)`, computed once and stored.
@@ -19,7 +21,11 @@ def materialise(always: Array, function: Callable[..., Any], *args: Any) -> Any:
 
     def never(*args: Any) -> Any:
         # Handing on an argument needs no code; zeros would be a kernel each.
-        some = {(x.shape, x.dtype): x for x in jax.tree.leaves(args)}
-        return jax.tree.map(lambda x: some.get((x.shape, x.dtype), jnp.zeros(x.shape, x.dtype)), shapes)
+        some = {_kind(x): x for x in jax.tree.leaves(args)}
+        return jax.tree.map(lambda x: some.get(_kind(x), as_varying(jnp.zeros(x.shape, x.dtype), x)), shapes)
 
     return lax.cond(always, function, never, *args)
+
+
+def _kind(x: Any) -> Any:
+    return x.shape, x.dtype, varying_axes(x)

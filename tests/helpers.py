@@ -109,6 +109,20 @@ def wavy_cloud(count, seed=0, height=0.1):
     return np.stack([x, y, z], axis=-1), grid_edges(wavy_grid(33, 33, height))
 
 
+def noisy_sheet(count, net):
+    """A rough height field at `count` random places, and a flat surface to start from. Its border, which is
+    held, is off the points: steps from it are damped, so that they hardly depend on rounding.
+    """
+    import jaxfit as jf
+
+    rng = np.random.default_rng(0)
+    points = rng.random((count, 3))
+    points[:, 2] = 0.2 * np.sin(5 * points[:, 0]) * np.cos(4 * points[:, 1]) + 1e-3 * rng.normal(size=count)
+    x, y = np.meshgrid(*(np.linspace(0, 1, n) for n in net), indexing="ij")
+    knots = [clamped_uniform(n, 4) for n in net]
+    return points, jf.BSplineSurface(np.stack([x, y, 0 * x], axis=-1), *knots)
+
+
 def grid_edges(grid):
     """The four edges of a grid as the arguments of a Boundary."""
     return {"v0": grid[:, 0], "v1": grid[:, -1], "u0": grid[0], "u1": grid[-1]}

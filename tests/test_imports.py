@@ -14,6 +14,7 @@ ROOMS = [
     ("_interrupt",),
     ("_checks",),
     ("_precision", "_progress_line"),
+    ("_varying",),
     ("_barrier", "_compile"),
     ("_splines",),
     ("_parameters",),

@@ -23,4 +23,5 @@ from jaxfit._approximation._losses import Tukey as Tukey
 from jaxfit._approximation._nesterov import Nesterov as Nesterov
 from jaxfit._approximation._orthogonal import OrthogonalDistance as OrthogonalDistance
 from jaxfit._approximation._regular_smoothing import RegularSmoothing as RegularSmoothing
+from jaxfit._approximation._shards import shard_points as shard_points
 from jaxfit._approximation._standard import StandardApproximation as StandardApproximation

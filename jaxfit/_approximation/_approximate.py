@@ -7,6 +7,8 @@ from jax.typing import ArrayLike
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._approximation._orthogonal import OrthogonalDistance
+from jaxfit._approximation._sharded_fit import fit_sharded_cloud
+from jaxfit._approximation._shards import divided_over
 from jaxfit._checks import eager_where_concrete
 from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._loop import Progress
@@ -93,6 +95,14 @@ def approximate(
     the boundary that they come from. Knots have none. `ImplicitAdjoint` says when `stats["stationarity"]`
     permits to trust a derivative; inside `jit` that is NaN unless the fit is differentiated there.
 
+    Points divided among the devices of a mesh (`shard_points`, also of several processes) are fitted where
+    they are, by the three methods of this library: each device has the rows of its own points, and one to
+    three sums of the size of the net go between devices in an iteration. u, v and errors stay divided.
+    Closest points on the first and the last surface are searched by each process for its own points. Refused
+    there: `adjoint`, `progress`, and what looks at all points together (knot insertion, local mode, a loss
+    without a scale, a chosen lambda). Inside `jit` a divided cloud is gathered; inside your own
+    `jax.shard_map` each device fits the clouds that it has.
+
     Examples
     --------
     >>> x, y = np.meshgrid(np.linspace(0, 1, 10), np.linspace(0, 1, 6), indexing="ij")
@@ -116,7 +126,8 @@ def approximate(
         "errors": errors,
         "adjoint": adjoint,
     }
-    return fit_cloud(points, base, default_method(method), request)
+    fit = fit_cloud if divided_over(points) is None else fit_sharded_cloud
+    return fit(points, base, default_method(method), request)
 
 
 def default_method(method: AbstractIterativeMethod | None) -> AbstractIterativeMethod:

@@ -62,7 +62,7 @@ def fit_cloud(
         nearest = closest_point(base, cloud)
         feet = nearest.u, nearest.v
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet)
-    order = _order_by_cell(begun, u, v, cloud.shape[0])
+    order = order_by_cell(begun, u, v, cloud.shape[0])
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
@@ -70,7 +70,7 @@ def fit_cloud(
     doing(f"fitting {nu} x {nv} control points to {cloud.shape[0]:,} points")
     loop = begin(method, together, begun, u[order], v[order], max_steps)
     loop, stats = run(method, together, loop, request["progress"] if concrete else None)
-    surface = fitted_surface(loop, base, begun, unit)
+    surface = fitted_surface(loop.current.surface, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
     if request["adjoint"] is not None or not is_concrete(given):
         here = loop.current
@@ -167,7 +167,7 @@ def _padded(x: Any, size: int, dtype: Any) -> Any:
     return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])]) if size > x.shape[0] else x
 
 
-def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
+def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
     """The points sorted by cell, the `count` true ones first.
 
     Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster.
@@ -183,13 +183,12 @@ def _order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
 
 
 def fitted_surface(
-    loop: LoopState, base: BSplineSurface, begun: WorkingSurface, unit: Unit
+    end: WorkingSurface, base: BSplineSurface, begun: WorkingSurface, unit: Unit
 ) -> BSplineSurface:
-    """The fitted surface in the user's unit. Control points that have not moved keep every bit.
+    """The surface that a fit ended with, in the user's unit. Control points that did not move keep every bit.
 
     Inside transformations a net with room for knots keeps its surplus control points.
     """
-    end = loop.current.surface
     concrete = is_concrete(end, base)
     if concrete and end.control_points.shape != begun.control_points.shape:
         end = end.trimmed()

@@ -26,6 +26,7 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
+from jaxfit._varying import as_varying
 
 
 class GeometricState(eqx.Module):
@@ -278,7 +279,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         if self.insertion is not None:
             surface = self.insertion(step, surface, iterate.projection, problem.counted)
         if momentum is not None:
-            rest = zero_momentum(surface.control_points)
+            rest = as_varying(zero_momentum(surface.control_points), momentum)
             momentum = lax.cond(changed, lambda: rest, lambda: momentum)
         state = GeometricState(state.sums, momentum, state.exceeded, state.extrapolation)
         return Iterate(surface, iterate.projection, state, step), history

@@ -53,7 +53,7 @@ class AbstractLeastSquares(eqx.Module):
 
 
 class GaussNewton(AbstractLeastSquares):
-    """`optimistix.GaussNewton` with the structured normal equations as its linear solver (the default).
+    """One Gauss-Newton step with the structured normal equations (the default).
 
     The residual is linear, so one step solves it: moments of the points within cells, one Cholesky
     factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
@@ -67,12 +67,9 @@ class GaussNewton(AbstractLeastSquares):
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """One step."""
-        import optimistix as optx
-
         linear = StructuredSolver(problem)
-        # The residual is linear, so the first step is the solution: no norm and no acceptance test is needed.
-        solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
-        return _free_part(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
+        step, _, _ = linear.compute(StructuredSolver.Side(), problem.residual(problem.net), {})
+        return _free_part(problem, problem.net - step), linear.shift
 
 
 class LevenbergMarquardt(AbstractLeastSquares):

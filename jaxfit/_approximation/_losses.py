@@ -183,6 +183,20 @@ def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) 
     return weight if loss is None else weight * loss.derivative((error / length) ** 2)
 
 
+class DataTerm(eqx.Module):
+    """The data term of the objective, the sum of the weights, and the number of points that have any."""
+
+    cost: Float[Array, ""]
+    weight: Float[Array, ""]
+    points: Float[Array, ""]
+
+    @staticmethod
+    def of(loss: AbstractLoss | None, length: Any, problem: Problem, error: Array) -> "DataTerm":
+        """Of the points of this device."""
+        cost = total_cost(loss, length, problem.weight, error)
+        return DataTerm(cost, jnp.sum(problem.weight), jnp.sum(problem.counted, dtype=error.dtype))
+
+
 def total_cost(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Float[Array, ""]:
     """The data term of the objective."""
     if loss is None:

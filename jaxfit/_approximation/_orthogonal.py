@@ -1,5 +1,6 @@
 """`OrthogonalDistance`: Gauss-Newton on the true distances, with the feet eliminated."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -22,7 +23,7 @@ from jaxfit._approximation._damping import (
 from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
-from jaxfit._approximation._losses import check_loss, loss_length, reweighted, total_cost
+from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
@@ -46,8 +47,17 @@ from jaxfit._normal_equations import AbstractPenalty, ThinPlate, WeightedPlate
 from jaxfit._splines._pieces import pieces_on
 
 
+class StepSums(eqx.Module):
+    """Sums over the points that decide on a step: the data term before and after it, and the longest move of
+    a foot.
+    """
+
+    costs: Float[Any, "2"]
+    longest_move: Float[Any, " devices"]
+
+
 class OrthogonalState(eqx.Module):
-    """The damping of the steps and the smoothing term of the last one.
+    """The damping of the steps, the smoothing term of the last one, and sums over the points.
 
     With RegularSmoothing() there is a `guard`; without it lambda, `smoothing`, against the sum of the
     weights. `plate` is the thin plate of a fit that keeps its knots.
@@ -58,6 +68,7 @@ class OrthogonalState(eqx.Module):
     guard: FoldGuard | None
     smoothing: Float[Any, ""]
     plate: ThinPlate | None
+    sums: StepSums
 
 
 class OrthogonalDistance(AbstractIterativeMethod):
@@ -194,39 +205,36 @@ class OrthogonalDistance(AbstractIterativeMethod):
         """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
         dtype = problem.target.dtype
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
-        damping, total = first_damping(surface, dtype), problem.weight.sum()
+        damping = first_damping(surface, dtype)
+        sums = StepSums(np.zeros(2, dtype), np.zeros(problem.devices, dtype))
         if isinstance(self.smoothing, RegularSmoothing):
             guard, nothing = self.smoothing.begin(surface)
-            return surface, OrthogonalState(damping, nothing, guard, np.zeros((), dtype), None)
-        smoothing = as_smoothing(self.smoothing, dtype) * total
+            return surface, OrthogonalState(damping, nothing, guard, np.zeros((), dtype), None, sums)
+        smoothing = as_smoothing(self.smoothing, dtype) * problem.total(problem.weight.sum())
         plate = constant_plate(self.insertion, surface)
         penalty = WeightedPlate(plate_of(plate, surface), smoothing)
-        return surface, OrthogonalState(damping, penalty, None, smoothing, plate)
+        return surface, OrthogonalState(damping, penalty, None, smoothing, plate, sums)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
         """Converged feet, starting from the last accepted ones, and the folds."""
-        surface, state = iterate.surface, iterate.state
-        here = measure_feet(
-            self.foot_method, problem, surface.pieces, iterate.projection, self.foot_tolerance
-        )
-        if state.guard is None:
-            return here, state
-        return here, eqx.tree_at(lambda s: s.guard, state, state.guard.seeing(surface))
+        surface, state, before = iterate.surface, iterate.state, iterate.projection
+        here = measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
+        # Both surfaces are compared with the same scale of the loss.
+        length = loss_length(self.loss, problem, before.error)
+        cost = jax.vmap(partial(total_cost, self.loss, length, problem.weight))
+        longest = farthest_move(surface.axes, (before.u, before.v), (here.u, here.v), problem.counted)
+        sums = StepSums(cost(jnp.stack([before.error, here.error])), problem.by_device(longest))
+        guard = None if state.guard is None else state.guard.seeing(surface)
+        return here, dataclasses.replace(state, sums=sums, guard=guard)
 
     def accept(self, problem: Problem, old: Iterate, new: Iterate) -> Iterate:
         """The new iterate if its objective is lower and it has no more folds, otherwise the old surface."""
         state, damped = new.state, new.state.damping
         here, before = new.projection, old.projection
-        # Both surfaces are compared with the same scale of the loss.
-        length = loss_length(self.loss, problem, before.error)
         nets = jnp.stack([damped.origin.control_points, new.surface.control_points])
-        costs = jax.vmap(partial(total_cost, self.loss, length, problem.weight))(
-            jnp.stack([before.error, here.error])
-        )
-        objective, after = costs + jax.vmap(state.penalty.energy)(nets)
+        objective, after = state.sums.costs + jax.vmap(state.penalty.energy)(nets)
         gain = objective - after
-        feet = (before.u, before.v), (here.u, here.v)
-        longest_move = farthest_move(new.surface.axes, *feet, problem.counted)
+        longest_move = jnp.max(state.sums.longest_move)
         # With a traced lambda that is none no step is finite, and the loop ends.
         lost = jnp.isnan(state.smoothing)
         good = better = lost | ((gain > 0) & is_plausible(damped, gain, longest_move))
@@ -239,11 +247,13 @@ class OrthogonalDistance(AbstractIterativeMethod):
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
         following = jnp.where(better & ~good, damped.damping, following)
         following = jnp.where(new.step == 1, self.damping, following)
-        kept = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
-        surface, projection = kept
-        projection = eqx.tree_at(lambda p: p.evaluations, projection, here.evaluations)
+        assert before.summary is not None
+        assert here.summary is not None
+        summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])
+        before = dataclasses.replace(before, evaluations=here.evaluations, summary=summary)
+        surface, projection = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
         damped = DampingState(surface, damped.predicted, following, damped.rejected_steps + ~good)
-        state = OrthogonalState(damped, state.penalty, guard, state.smoothing, state.plate)
+        state = dataclasses.replace(state, damping=damped, guard=guard)
         return Iterate(surface, projection, state, new.step)
 
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
@@ -264,16 +274,18 @@ class OrthogonalDistance(AbstractIterativeMethod):
             lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
             *(net, *feet, damping),
         )
+        term = DataTerm.of(self.loss, length, problem, here.error)
+        equations, term = problem.total((equations, term))
         if guard is None:
             plate = plate_of(state.plate, surface)
             penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
-            cost = total_cost(self.loss, length, problem.weight, here.error)
-            penalty = self.smoothing.penalty(guard, surface, problem, cost)
+            penalty = self.smoothing.penalty(guard, surface, problem.diagonal, term)
 
         def correction_rhs(net: Array, move: Array) -> Array:
             pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
-            return materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
+            own = materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
+            return problem.total(own)
 
         def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
             return gauss_newton_step(penalty, self.reach, correction_rhs, *x)
@@ -282,7 +294,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         lost = jnp.isnan(state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
         damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)
-        state = OrthogonalState(damped, penalty, guard, state.smoothing, state.plate)
+        state = dataclasses.replace(state, damping=damped, penalty=penalty, guard=guard)
         return Iterate(surface.moved_to(following), here, state, iterate.step + 1), history
 
     def stationarity(
@@ -294,9 +306,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
             smoothing = as_smoothing(self.smoothing, error.dtype) * jnp.sum(problem.weight)
             penalty: AbstractPenalty = WeightedPlate(plate_of(state.plate, surface), smoothing)
         else:
-            cost = total_cost(self.loss, length, problem.weight, error)
+            term = DataTerm.of(self.loss, length, problem, error)
             guard = self.smoothing.following_least(state.guard)
-            penalty = self.smoothing.penalty(guard, surface, problem, cost)
+            penalty = self.smoothing.penalty(guard, surface, problem.diagonal, term)
         held = held_points(self.border, surface.control_points.shape, surface.used)
         return Stationarity(reweighted(self.loss, length, problem.weight, error), held, penalty)
 
@@ -320,7 +332,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         stats = {"damping": state.damping.damping, "rejected_steps": state.damping.rejected_steps}
         if state.guard is not None:
             away = self.smoothing.held_back(state.guard, surface, problem, iterate.projection)
-            return iterate, {"points_out_of_reach": jnp.sum(away, dtype=jnp.int32), **stats}
+            out_of_reach = problem.total(jnp.sum(away, dtype=jnp.int32))
+            return iterate, {"points_out_of_reach": out_of_reach, **stats}
         energy = plate_of(state.plate, surface).energy(surface.control_points) * problem.scale**2
         return iterate, {
             "smoothing": as_smoothing(self.smoothing, energy.dtype),

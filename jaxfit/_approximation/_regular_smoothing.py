@@ -10,6 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._folds import folds_by_cell, near_folds
+from jaxfit._approximation._losses import DataTerm
 from jaxfit._checks import Scalar, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
@@ -121,13 +122,13 @@ class RegularSmoothing(eqx.Module):
         return FoldGuard(factor, floor, zero, zero, folds), nothing
 
     def penalty(
-        self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, cost: Array
+        self, guard: "FoldGuard", surface: WorkingSurface, diagonal: Array, term: DataTerm
     ) -> Roughness:
-        """The smoothing term of a step from a surface at which the data term of the objective is `cost`."""
+        """The smoothing term of a step from a surface at which the data term of the objective is `term`."""
         knots, net = (surface.knots_u, surface.knots_v), jnp.asarray(surface.control_points)
         least = jnp.finfo(net.dtype).tiny  # a root of 0 has no derivative
-        distance = jnp.sqrt(jnp.maximum(cost / jnp.sum(problem.weight), least)) / problem.diagonal
-        rho = cost / jnp.sum(problem.counted) * jnp.minimum(distance / FINE, 1.0)
+        distance = jnp.sqrt(jnp.maximum(term.cost / term.weight, least)) / diagonal
+        rho = term.cost / term.points * jnp.minimum(distance / FINE, 1.0)
         return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 
     def after(
@@ -164,7 +165,8 @@ class RegularSmoothing(eqx.Module):
             axis.locate(x) + axis.polynomials.shape[1] // 2
             for axis, x in zip(jax.tree.map(jnp.asarray, surface.axes), (here.u, here.v), strict=True)
         )
-        average = jnp.sum(jnp.where(problem.counted, here.error, 0.0)) / jnp.sum(problem.counted)
+        assert here.summary is not None
+        average = here.summary[0] * problem.diagonal
         stiff = jnp.asarray(guard.floor)[i, j] > self.least
         return problem.counted & stiff & (here.error > FAR * average)
 

@@ -165,7 +165,10 @@ class StandardApproximation(AbstractIterativeMethod):
         error = values_at(surface.pieces, before.u, before.v) - problem.target
         distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
         active = jnp.sum(problem.counted, dtype=jnp.int32)
-        return Projection(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True))
+        return Projection(
+            *(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True)),
+            before.summary,
+        )
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
         """Feet, or without correction the errors at the same parameters."""

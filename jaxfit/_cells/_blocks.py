@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxfit._cells._rows import Rows
+from jaxfit._varying import as_varying
 
 # On a CPU, what a block computes stays in the caches. Elsewhere everything goes at once.
 SLOTS_PER_BLOCK = 4096
@@ -33,5 +34,5 @@ def over_blocks(
         fresh = jnp.arange(size) + jnp.minimum(start, count - size) >= start
         return start + size, add(part, part.filled & fresh[:, None], total)
 
-    start = jnp.asarray(0, jnp.int32)
-    return lax.while_loop(lambda x: x[0] < rows.used, block, (start, begin))[1]
+    first = jnp.asarray(0, jnp.int32), as_varying(begin, begin, rows)
+    return lax.while_loop(lambda x: x[0] < rows.used, block, first)[1]

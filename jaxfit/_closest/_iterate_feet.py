@@ -39,6 +39,7 @@ from jaxfit._closest._safeguarded_step import Mode, MovingFeet, advance
 from jaxfit._closest._smooth_regions import SmoothRegion, cells_of_regions, cross_creases, initial_region
 from jaxfit._closest._taylor_projection import third_derivatives
 from jaxfit._splines._pieces import Pieces
+from jaxfit._varying import as_varying
 
 # Steps in one pass where rows hold several points, as long as at least one foot in so many still moves.
 STEPS_PER_PASS = 3
@@ -127,7 +128,7 @@ def iterate_feet(
             moved, region = cross_creases(pieces, feet, moved, region, limits)
         return moved, region, total
 
-    begin = (feet, region, total)
+    begin = as_varying((feet, region, total), pieces, target, feet, weight)
     feet, _, total = lax.while_loop(lambda carry: jnp.any(waiting(carry[0])), one, begin)
     return feet, None if sums is None else sums.finish(total, pieces)
 
@@ -186,7 +187,7 @@ class _Pass(eqx.Module):
         else:
             takes_part &= state < SUMMED_FOUND
             going = jnp.where(takes_part, float(GOING), float(FOUND)).astype(f.dtype)
-        e = None if self.sums is None else jnp.zeros((1, self.target.shape[0], slots), f.dtype)
+        e = None if self.sums is None else as_varying(jnp.zeros((1, self.target.shape[0], slots), f.dtype), f)
         return MovingFeet(trial, best, f, steps, going, e), takes_part, state
 
     def _steps(self, part: Rows, feet: MovingFeet, bounds: Bounds, third: Array) -> MovingFeet:

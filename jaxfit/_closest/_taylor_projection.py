@@ -153,4 +153,4 @@ def linearised_step(
     step = jnp.where(2.0 * along >= length2, step, shortest * step)
     e = at.e - total(step * at.first)
     f = inner(e, e)
-    return Prediction(bounds.end_of_step(x, step), e, f, jnp.ones(f.shape, bool))
+    return Prediction(bounds.end_of_step(x, step), e, f, jnp.ones_like(f, bool))

@@ -25,7 +25,10 @@ def measure_feet(
     idle, tolerance = ~jnp.asarray(problem.real), foot_tolerance * problem.diagonal
     feet, _ = update_feet(method, pieces, problem.target, before.u, before.v, tolerance, idle=idle)
     active = jnp.sum(problem.counted, dtype=jnp.int32)
-    return Projection(feet.u, feet.v, feet.error, feet.evaluations, feet.converged, active, jnp.asarray(True))
+    return Projection(
+        *(feet.u, feet.v, feet.error, feet.evaluations, feet.converged, active, jnp.asarray(True)),
+        before.summary,
+    )
 
 
 def measure_grid(
@@ -55,7 +58,10 @@ def measure_grid(
     )
     error = jnp.where(held, 0.0, jnp.sqrt(jnp.where(held, 0.0, feet.squared_distance)))
     active = jnp.sum(problem.counted, dtype=jnp.int32)
-    return Projection(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True))
+    return Projection(
+        *(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True)),
+        before.summary,
+    )
 
 
 def side_bounds(axes: tuple[Axis, Axis], nu: int, nv: int) -> ParameterBounds:

@@ -55,7 +55,7 @@ class ErrorHistory(eqx.Module):
 
     def append(self, step: Array, errors: Any, counts: Any = None) -> "ErrorHistory":
         """The history with the entry of iteration `step`; without `counts` the last ones are repeated."""
-        entry = jnp.stack([jnp.asarray(x, self.errors.dtype) for x in errors])
+        entry = jnp.asarray(errors, self.errors.dtype)
         at = step % self.capacity
         first = jnp.where(step == 0, entry[0], self.first)
         if counts is None:

@@ -4,6 +4,7 @@ It ends on a surface that has been measured exactly. It calls methods through th
 `AbstractIterativeMethod` only.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,10 +20,11 @@ from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
-from jaxfit._fit._problem import Problem
+from jaxfit._fit._problem import Problem, summary_of
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._varying import as_varying, as_varying_as
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
@@ -46,9 +48,9 @@ def begin(
 ) -> LoopState:
     """The state before the first measurement; the history has room for `max_steps` moves."""
     xp: Any = np if is_concrete(surface, u, v) else jnp  # NumPy's arrays cost no calls of their own
-    none = xp.zeros(u.shape, np.int32)
+    none = xp.zeros_like(u, np.int32)
     nothing = xp.zeros((), np.int32)
-    feet = Projection(u, v, xp.zeros_like(u), none, none > 0, nothing, nothing > 0)
+    feet = Projection(u, v, xp.zeros_like(u), none, none > 0, nothing, nothing > 0, np.zeros(4, u.dtype))
     surface, state = method.init(problem, surface, feet)
     iterate = Iterate(surface, feet, state, nothing)
     history = ErrorHistory.empty(max_steps, problem.target.dtype)
@@ -87,26 +89,29 @@ def run(
 def _advance(
     rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState
 ) -> tuple[LoopState, dict[str, Any]]:
-    """Iterate up to step `until`, or to the end, and postprocess.
+    """`iterate`, compiled.
 
     On a CPU a batch is fitted one after the other (`sequential_vmap`). An ordinary `vmap` would take every
     branch, and would gain nothing from doing the same steps at once.
     """
-    whole = partial(_iterate, rest)
+    whole = partial(iterate, rest)
     if jax.default_backend() == "cpu":
         whole = jax.custom_batching.sequential_vmap(whole)
     return whole(numbers, problem, until, loop)
 
 
-def _iterate(
+def iterate(
     rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState
 ) -> tuple[LoopState, dict[str, Any]]:
+    """Iterate up to step `until`, or to the end, and postprocess; `rest` are the method's static fields."""
     method = eqx.combine(numbers, rest)
     running = code_of(RESULTS.running)
 
     def unfinished(loop: LoopState) -> Array:
         return (loop.code == running) & (loop.next.step <= until)
 
+    if problem.axis is None:  # each device its own fit: all of it differs from device to device
+        loop = as_varying(loop, numbers, problem, loop)
     loop = lax.while_loop(unfinished, partial(_one_iteration, method, problem), loop)
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
     last, stats = method.postprocess(problem, loop.current, early)
@@ -117,18 +122,34 @@ def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: Loop
     """Measure, accept, record, decide, move."""
     old, new = loop.current, loop.next
     projection, state = method.measure(problem, new, loop.exact)
-    new = Iterate(new.surface, projection, state, new.step)
+    projection, state = _over_all_points(problem, projection, old.projection, state)
+    new = as_varying_as(Iterate(new.surface, projection, state, new.step), new)
     new = lax.cond(new.step > 0, lambda: method.accept(problem, old, new), lambda: new)
-    return record_and_move(method, problem, loop, new, problem.summarise(new.projection, old.projection))
+    return record_and_move(method, problem, loop, new)
+
+
+def _over_all_points(
+    problem: Problem, projection: Projection, before: Projection, state: Any
+) -> tuple[Projection, Any]:
+    """The projection with its summary, and the state whose `sums`, if it has any, are those over all points:
+    one reduction over the devices.
+    """
+    totals, maximum = problem.totals(projection, before)
+    sums = getattr(state, "sums", None)
+    parts = (totals, problem.by_device(maximum), projection.active, sums)
+    totals, maxima, active, sums = problem.total(parts)
+    summary = summary_of(totals, jnp.max(maxima))
+    projection = dataclasses.replace(projection, active=active, summary=summary)
+    return projection, state if sums is None else eqx.tree_at(lambda s: s.sums, state, sums)
 
 
 def record_and_move(
-    method: AbstractIterativeMethod, problem: Problem, loop: LoopState, new: Iterate, errors: Array
+    method: AbstractIterativeMethod, problem: Problem, loop: LoopState, new: Iterate
 ) -> LoopState:
-    """Record the `errors` of an iterate that has been measured and accepted, decide, and move."""
+    """Record the errors of an iterate that has been measured and accepted, decide, and move."""
     running, diverged = code_of(RESULTS.running), code_of(RESULTS.diverged)
     counts = jnp.concatenate([new.projection.active[None], jnp.asarray(new.surface.used)])
-    history = loop.history.append(new.step, errors, counts)
+    history = loop.history.append(new.step, new.projection.summary, counts)
     code = _decide(method, problem, new, history)
     again = (code != running) & (code != diverged) & ~new.projection.exact
     code = jnp.where(again, running, code)
@@ -137,9 +158,9 @@ def record_and_move(
         lambda: method.move(problem, new, history),
         lambda: (new, history),
     )
-    good = LoopState(new, following, history, code, again)
+    good = as_varying_as(LoopState(new, following, history, code, again), loop)
     # A surface that is not finite, or far worse than the first, is discarded.
-    kept = eqx.tree_at(lambda x: x.code, loop, code)
+    kept = eqx.tree_at(lambda x: x.code, loop, good.code)
     return lax.cond((code == diverged) & (new.step > 0), lambda: kept, lambda: good)
 
 

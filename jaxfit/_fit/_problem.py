@@ -5,13 +5,16 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit
 from jaxfit._precision import bucket, working_dtype
+
+MeshAxis = str | tuple[str, ...] | None
 
 
 class Tolerances(eqx.Module):
@@ -38,13 +41,16 @@ class Problem(eqx.Module):
     scale : array ()
         The unit of the problem, in the user's unit.
     tolerances : Tolerances
+    axis : str or tuple of str, optional
+        The axis of a mesh over which the points are divided among devices, each of which has a problem with
+        its own ones (default None: this problem has all points).
 
     Examples
     --------
-    The loop passes it to the functions of a method; `problem.counted` and `problem.summarise` follow from:
+    The loop passes it to the functions of a method; `problem.counted` and `problem.total` follow from:
 
     >>> list(jf.Problem.__dataclass_fields__)
-    ['target', 'weight', 'real', 'diagonal', 'scale', 'tolerances']
+    ['target', 'weight', 'real', 'diagonal', 'scale', 'tolerances', 'axis']
     """
 
     target: Float[Any, "d points"]
@@ -53,6 +59,25 @@ class Problem(eqx.Module):
     diagonal: Float[Any, ""]
     scale: Float[Any, ""]
     tolerances: Tolerances
+    axis: MeshAxis = eqx.field(static=True, default=None)
+
+    @property
+    def devices(self) -> int:
+        """Over how many devices the points are divided."""
+        return 1 if self.axis is None else lax.axis_size(self.axis)
+
+    def total(self, sums: Any) -> Any:
+        """Sums over all points, of a tree with the sums over those of this device: one reduction for all."""
+        if self.axis is None:
+            return sums
+        flat, restore = ravel_pytree(sums)
+        return restore(lax.psum(flat, self.axis))
+
+    def by_device(self, x: Float[Array, ""]) -> Float[Array, " devices"]:
+        """What adds up to the numbers of all devices, where each has its own: so `total` brings maxima."""
+        if self.axis is None:
+            return x[None]
+        return jnp.where(jnp.arange(self.devices) == lax.axis_index(self.axis), x, 0.0)
 
     @property
     def counted(self) -> Bool[Array, " points"]:
@@ -65,28 +90,27 @@ class Problem(eqx.Module):
         parts = [xp.asarray(x)[..., order] for x in (self.target, self.weight, self.real)]
         return eqx.tree_at(lambda p: [p.target, p.weight, p.real], self, parts)
 
-    def summarise(self, projection: Projection, before: Projection) -> Float[Array, "4"]:
-        """Average and maximum error as fractions of the diagonal, and the average evaluations and changes.
-
-        The last two are per foot: evaluations of the surface, and change of the parameters u plus v.
-        """
-        sums, maximum = self.totals(projection, before)
-        average, evaluations, change = sums / jnp.sum(self.counted)
-        return jnp.stack([average, maximum, evaluations, change])
-
     def totals(
         self, projection: Projection, before: Projection
-    ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        """Sums of errors, evaluations and changes over the points of positive weight; the greatest error."""
+    ) -> tuple[Float[Array, "4"], Float[Array, ""]]:
+        """Sums of errors, evaluations and changes over the points of positive weight, and their number; the
+        greatest error.
+        """
         change = jnp.abs(projection.u - before.u) + jnp.abs(projection.v - before.v)
         evaluations = projection.evaluations.astype(change.dtype)
-        rows = jnp.stack([projection.error / self.diagonal, evaluations, change])
+        rows = jnp.stack([projection.error / self.diagonal, evaluations, change, jnp.ones_like(change)])
         rows = jnp.where(self.counted[None], rows, 0.0)
         return jnp.sum(rows, axis=1), jnp.max(rows[0])
 
 
+def summary_of(totals: Float[Array, "4"], maximum: Float[Array, ""]) -> Float[Array, "4"]:
+    """The summary of a projection, from `Problem.totals` over all points."""
+    means = totals[:3] / totals[3]
+    return jnp.concatenate([means[:1], maximum[None], means[1:]])
+
+
 def make_problem(
-    points: Any, weights: Any, unit: Unit, tolerances: Tolerances, padded: bool = True
+    points: Any, weights: Any, unit: Unit, tolerances: Tolerances, padded: bool = True, axis: MeshAxis = None
 ) -> Problem:
     """The problem of `points`, `padded` to their bucket where they are concrete."""
     count, dtype = points.shape[0], working_dtype()
@@ -106,4 +130,5 @@ def make_problem(
         diagonal=yp.asarray(unit.diagonal / unit.scale, dtype),
         scale=yp.asarray(unit.scale, dtype),
         tolerances=tolerances,
+        axis=axis,
     )

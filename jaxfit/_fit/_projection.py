@@ -23,6 +23,10 @@ class Projection(eqx.Module):
         The number of points that influence the next move.
     exact : array () of bool
         False where errors are predictions. Before it stops the loop measures once more, exactly.
+    summary : array (4,)
+        Filled in by the loop: average and maximum error as fractions of the diagonal, evaluations of the
+        surface for each foot, and change of its parameters u plus v, both on average. Points of weight 0 are
+        left out.
 
     Examples
     --------
@@ -39,3 +43,4 @@ class Projection(eqx.Module):
     converged: Bool[Any, " points"]
     active: Int[Any, ""]
     exact: Bool[Any, ""]
+    summary: Float[Any, "4"] | None = None

@@ -17,6 +17,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._normal_equations._stencil import Stencil
+from jaxfit._varying import as_varying
 
 # Pivots below this share of the diagonal count as zero (with data enough they stay above 1e-5), and this
 # share is then added to it. Solved for are corrections, so the shift does not bias what a few of them come
@@ -66,7 +67,7 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
 
     zero = jnp.zeros((), entries.dtype)
     blocks = (jnp.zeros((nu, nv, nv), entries.dtype), jnp.zeros((nu, reach, nv), entries.dtype), zero)
-    begin = (blocks, zero, jnp.asarray(0, jnp.int32))
+    begin = as_varying((blocks, zero, jnp.asarray(0, jnp.int32)), entries, free)
     (inverse, below, _), shift, _ = lax.while_loop(failed, attempt, begin)
     return Factors(inverse, below, shift, transposed)
 
@@ -99,7 +100,7 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, A
     rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(2, 0, 1, 3))
     # What is taken off the rows to come: by columns of blocks, from the diagonal down.
     window = [jnp.zeros((reach - j * nv, nv), entries.dtype) for j in range(order - 1)]
-    _, (inverse, below, least) = lax.scan(step, window, rows)
+    _, (inverse, below, least) = lax.scan(step, as_varying(window, entries, free, shift), rows)
     return inverse, below, jnp.min(least)
 
 
@@ -121,7 +122,7 @@ def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Arr
         swept = jnp.where(across | along, 0.0, matrix) - share
         return swept, jnp.minimum(least, pivot[0] / own)
 
-    most = jnp.full(1, jnp.inf, block.dtype)
+    most = jnp.full_like(size[:1], jnp.inf)
     swept, least = lax.fori_loop(0, count, sweep, (block, most))
     return -swept, least
 
@@ -153,7 +154,7 @@ def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array,
         value = inverse @ value - below.T @ later
         return jnp.concatenate([value, later[: reach - count]]), value
 
-    none = jnp.zeros((reach, channels), right.dtype)
+    none = as_varying(jnp.zeros((reach, channels), right.dtype), factors, right)
     _, half = lax.scan(forward, none, (factors.below, right))
     _, whole = lax.scan(backward, none, (factors.inverse, factors.below, half), reverse=True)
     return whole.transpose(1, 0, 2) if factors.transposed else whole

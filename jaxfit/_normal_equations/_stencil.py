@@ -15,6 +15,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._splines._pieces import Numbers
+from jaxfit._varying import as_varying
 
 
 class Stencil(eqx.Module):
@@ -79,7 +80,7 @@ def shifted_products(
         return total + lax.squeeze(entry, (1, 2, 3)) * lax.squeeze(neighbour, (0,)), None
 
     none = jnp.zeros((max(p, x.shape[1]), nu, nv), jnp.result_type(entries, x))
-    return lax.scan(add, none, (stored, a, b))[0]
+    return lax.scan(add, as_varying(none, entries, x), (stored, a, b))[0]
 
 
 def shifted_slices(x: Any, count: int, size: int, axis: int) -> Any:

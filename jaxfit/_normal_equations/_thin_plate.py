@@ -22,6 +22,7 @@ from jaxfit._cells import overlap_add
 from jaxfit._checks import is_concrete
 from jaxfit._normal_equations._stencil import Stencil, shifted_slices
 from jaxfit._splines._pieces import Axis, Numbers
+from jaxfit._varying import as_varying
 
 TERMS = np.sqrt([1.0, 2.0, 1.0])  # of R_vv, R_uv and R_uu, by the order of the derivative along u
 
@@ -64,7 +65,8 @@ class ThinPlate(eqx.Module):
     def adjoint(self, residual: Bending) -> Float[Array, "nu nv c"]:
         """L^T times such values; of L P the gradient of F_s / 2."""
         (nu, nv), c = self.shape, residual.shape[-1]
-        net = jax.ShapeDtypeStruct((nu, nv, c), residual.dtype)
+        # Of a net that is the same on all devices the transpose would be a sum over them.
+        net, residual = as_varying((jnp.zeros((nu, nv, c), residual.dtype), residual), residual, self)
         return jax.linear_transpose(self.residual, net)(residual)[0]
 
     @property

@@ -15,6 +15,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._splines._basis import spans_and_weights
+from jaxfit._varying import as_varying
 
 UNROLL = 2  # rows per iteration of a loop over right-hand sides
 
@@ -83,7 +84,7 @@ def factorise(band: Float[Array, "n band"]) -> tuple[Array, Array]:
         return jnp.concatenate([above[1:], rest[None]]), (jnp.stack(multipliers), rest)
 
     identity = jnp.zeros((reach, reach + 1), band.dtype).at[:, 0].set(1.0)
-    return lax.scan(eliminate, identity, band)[1]
+    return lax.scan(eliminate, as_varying(identity, band), band)[1]
 
 
 def substitute(factors: tuple[Array, Array], right: Float[Array, "n columns"]) -> Float[Array, "n columns"]:

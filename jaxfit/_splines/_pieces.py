@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
 from jaxfit._splines._lookup import last_not_above, windows
+from jaxfit._varying import as_varying
 
 Numbers = Array | np.ndarray
 
@@ -191,7 +192,7 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
             def step(basis: Any, left: Any) -> tuple[Any, None]:
                 return _raised_polynomials(basis, left, right), None
 
-            basis = lax.scan(step, jnp.asarray(basis), left, reverse=True)[0]
+            basis = lax.scan(step, as_varying(jnp.asarray(basis), left), left, reverse=True)[0]
     return basis.transpose(2, 0, 1)
 
 

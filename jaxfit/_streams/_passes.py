@@ -13,6 +13,7 @@ import numpy as np
 from jax import Array
 
 from jaxfit._approximation._errors import AbstractErrors
+from jaxfit._approximation._methods_by_sums import static_and_numbers
 from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._fit._method import Iterate
@@ -22,7 +23,6 @@ from jaxfit._fit._scaling import Unit
 from jaxfit._precision import bucket, working_dtype
 from jaxfit._splines import BSplineSurface
 from jaxfit._streams._blocks import Blocks, Points
-from jaxfit._streams._methods import static_and_numbers
 from jaxfit._streams._stored_feet import StoredFeet
 
 # Blocks at a time. More would take memory, and a search for first feet has threads of its own.
@@ -33,7 +33,7 @@ class Measured(NamedTuple):
     """Sums over the points of one block, or of all of them."""
 
     sums: Any  # of the method
-    totals: Any  # errors, evaluations and changes
+    totals: Any  # errors, evaluations and changes, and their number
     maximum: Any  # error
     active: Any  # points
     exact: Any  # whether errors are none that are predicted

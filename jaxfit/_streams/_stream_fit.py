@@ -6,19 +6,18 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from jaxfit._approximation._checked_arguments import check_options, checked_start, checked_weights
 from jaxfit._approximation._cloud_fit import LEAST_POINTS, fitted_surface, tolerances_of, working_surface
 from jaxfit._approximation._errors import GlobalFeet
+from jaxfit._approximation._methods_by_sums import IN_BLOCKS, by_sums, static_and_numbers
 from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, record_and_move
 from jaxfit._fit._method import AbstractIterativeMethod
-from jaxfit._fit._problem import Problem, make_problem
+from jaxfit._fit._problem import Problem, make_problem, summary_of
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, Name, converged_or_raise
 from jaxfit._fit._scaling import Unit, unit_of
@@ -26,7 +25,6 @@ from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._progress_line import doing
 from jaxfit._splines import BSplineSurface
 from jaxfit._streams._blocks import Blocks, Source
-from jaxfit._streams._methods import by_sums, static_and_numbers
 from jaxfit._streams._passes import Measured, Passes
 from jaxfit._streams._stored_feet import StoredFeet
 
@@ -50,7 +48,7 @@ def fit_stream(
     searched = base if request["start"] is None else None
     loop = _run(passes, nothing, loop, searched, request["progress"])
     stats = _postprocess(*static_and_numbers(streamed), nothing, loop)
-    surface = fitted_surface(loop, base, begun, unit)
+    surface = fitted_surface(loop.current.surface, base, begun, unit)
     lost = int(loop.code) == code_of(RESULTS.diverged)  # the stored feet are those of a surface given up
     errors = GlobalFeet() if request["errors"] is None else request["errors"]
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
@@ -79,7 +77,7 @@ def _checked_method(
     for tolerance in goals:
         if tolerance is not None:
             advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
-    return by_sums(method)
+    return by_sums(method, IN_BLOCKS, "where points are read in blocks")
 
 
 def _opened(
@@ -148,12 +146,11 @@ def _run(
     passes: Passes, problem: Problem, loop: LoopState, searched: BSplineSurface | None, progress: Any
 ) -> LoopState:
     """The loop of `_fit/_loop.py` on the host: a pass, then what follows from its sums."""
-    counted = np.asarray(passes.counted, np.int32)
     while int(loop.code) == code_of(RESULTS.running):
         doing(f"pass {int(loop.next.step) + 1} over {passes.blocks.count:,} points")
         measured = passes.measure(loop.next, loop.exact, searched)
         searched = None
-        loop = _advance(*static_and_numbers(passes.method), problem, loop, measured, counted)
+        loop = _advance(*static_and_numbers(passes.method), problem, loop, measured)
         if progress is not None:
             step = int(loop.current.step)
             average, maximum = np.asarray(loop.history.errors)[:2, step % loop.history.capacity]
@@ -162,18 +159,15 @@ def _run(
 
 
 @partial(compiled, static_argnums=0)
-def _advance(
-    rest: Any, numbers: Any, problem: Problem, loop: LoopState, measured: Measured, counted: Array
-) -> LoopState:
+def _advance(rest: Any, numbers: Any, problem: Problem, loop: LoopState, measured: Measured) -> LoopState:
     """Record the errors, decide, and move. The problem holds no points."""
     new = loop.next
     state = eqx.tree_at(lambda x: x.sums, new.state, measured.sums)
-    parts = (measured.active, measured.exact)
-    projection = eqx.tree_at(lambda x: (x.active, x.exact), new.projection, parts)
+    summary = summary_of(measured.totals, measured.maximum)
+    parts = (measured.active, measured.exact, summary)
+    projection = eqx.tree_at(lambda x: (x.active, x.exact, x.summary), new.projection, parts)
     new = eqx.tree_at(lambda x: (x.projection, x.state), new, (projection, state))
-    average, evaluations, change = measured.totals / counted
-    errors = jnp.stack([average, measured.maximum, evaluations, change])
-    return record_and_move(eqx.combine(numbers, rest), problem, loop, new, errors)
+    return record_and_move(eqx.combine(numbers, rest), problem, loop, new)
 
 
 @partial(compiled, static_argnums=0)

@@ -1,4 +1,4 @@
-"""Methods whose moves need sums over the points only: their `state.sums`, added up block by block."""
+"""Methods whose moves need sums over the points only: their `state.sums`, added up over blocks or devices."""
 
 import dataclasses
 from typing import Any
@@ -10,10 +10,12 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation import GaussNewton, GeometricApproximation, StandardApproximation
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing
+from jaxfit._approximation._geometric import GeometricApproximation
+from jaxfit._approximation._least_squares import GaussNewton
+from jaxfit._approximation._orthogonal import OrthogonalDistance
 from jaxfit._approximation._smoothing_term import plate_of
-from jaxfit._approximation._standard import StandardState
+from jaxfit._approximation._standard import StandardApproximation, StandardState
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
 from jaxfit._fit._problem import Problem
@@ -46,7 +48,7 @@ class StandardBySums(StandardApproximation):
         surface, state = super().init(problem, surface, projection)
         net = surface.control_points
         entries = np.zeros((*surface.order, *net.shape[:2]), net.dtype)
-        sums = NormalSums(Stencil(entries), np.zeros_like(net))
+        sums = NormalSums(Stencil(entries), np.zeros(net.shape, net.dtype))
         return surface, StateWithSums(state.smoothing, state.shift, state.plate, sums)
 
     def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StateWithSums]:
@@ -86,23 +88,28 @@ class GeometricBySums(GeometricApproximation):
         return False
 
 
-_BY_SUMS: dict[type, type] = {
+IN_BLOCKS: dict[type, type] = {
     StandardApproximation: StandardBySums,
     GeometricApproximation: GeometricBySums,
 }
+ON_DEVICES: dict[type, type] = {**IN_BLOCKS, OrthogonalDistance: OrthogonalDistance}
 
 
-def by_sums(method: AbstractIterativeMethod) -> AbstractIterativeMethod:
-    """The method, kept to sums over the points; raises if it needs more."""
-    kind = _BY_SUMS.get(type(method))
+def by_sums(method: AbstractIterativeMethod, kinds: dict[type, type], where: str) -> AbstractIterativeMethod:
+    """The method, kept to sums over the points, by one of `kinds`; raises if it needs more.
+
+    `where` says in an error what the points are like.
+    """
+    kind = kinds.get(type(method))
     if kind is None:
+        *others, last = (f"{x.__name__}()" for x in kinds)
         raise TypeError(
-            "method must be StandardApproximation() or GeometricApproximation(), whose moves follow from "
-            f"sums over the points, but is {type(method).__name__}(); pass one of these, or fit in memory by "
+            f"method must be {', '.join(others)} or {last}, whose moves follow from sums over the points, "
+            f"{where}, but is {type(method).__name__}(); pass one of these, or fit the points together by "
             "approximate(points, base, method)."
         )
     fields = {x.name: getattr(method, x.name) for x in dataclasses.fields(method)}
-    _check_fields(fields)
+    _check_fields(fields, where)
     return kind(**fields)
 
 
@@ -112,7 +119,7 @@ def static_and_numbers(method: AbstractIterativeMethod) -> tuple[Any, Any]:
     return rest, jax.tree.map(lambda x: np.asarray(x, working_dtype()), numbers)
 
 
-def _check_fields(fields: dict[str, Any]) -> None:
+def _check_fields(fields: dict[str, Any], where: str) -> None:
     """Raise for an option that looks at all points together."""
     loss = fields["loss"]
     refused = {
@@ -125,7 +132,6 @@ def _check_fields(fields: dict[str, Any]) -> None:
     for name, (instead, wrong) in refused.items():
         if wrong:
             raise ValueError(
-                f"the method's {name} must be {instead} where points are read in blocks, but is "
-                f"{fields[name]!r}, which looks at all points together; pass {instead}, or fit in memory by "
-                "approximate."
+                f"the method's {name} must be {instead} {where}, but is {fields[name]!r}, which looks at all "
+                f"points together; pass {instead}, or fit the points together by approximate."
             )
