@@ -17,10 +17,8 @@ from jaxfit._normal_equations import (
     solve_coupled,
 )
 
-RESIDUAL = (
-    1e-4  # of a step's linear system, where conjugate gradients stop, if their number does not end them
-)
-# Conjugate gradients of a step: few, for far from the end an exact solution is no better. At small mu steps
+RESIDUAL = 1e-4  # of a step's linear system, where conjugate gradients stop
+# Or after so many: few, for far from the end an exact solution is no better. At small mu steps
 # achieve what they predict, and the last digits take many.
 FEW_STEPS, MANY_STEPS = 25, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
