@@ -24,7 +24,7 @@ def folds_by_cell(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
     def number(axis: int) -> Float[Array, "a b"]:
         """Folds between neighbours along u or v, the last of a cell and the first of the next included."""
 
-        def neighbours(x: Array) -> tuple[Array, Array]:
+        def neighbours(x: Array) -> tuple[Array, ...]:
             inside, cells = x.ndim - 4 + axis, x.ndim - 2 + axis
             first, last = (lax.slice_in_dim(x, k, k + 1, axis=inside) for k in (0, SAMPLES - 1))
             count = x.shape[cells]

@@ -78,6 +78,7 @@ def newton_system(
     between = Stencil(jnp.sqrt(damping) * fixed.entries)  # as in a step of the fit
     if condition.penalty is not None:
         stiffness = condition.penalty.system(surface.control_points)[0]
-        matrix, fixed, between = (x.plus(stiffness, 1.0) for x in (matrix, fixed, between))
+        matrix, fixed = matrix.plus(stiffness, 1.0), fixed.plus(stiffness, 1.0)
+        between = between.plus(stiffness, 1.0)
     free = free_points(fixed, condition.held)
     return NewtonSystem(coupled_preconditioner(matrix, between, free), fixed, free)
