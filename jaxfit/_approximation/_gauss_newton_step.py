@@ -17,10 +17,10 @@ from jaxfit._normal_equations import (
     solve_coupled,
 )
 
-RESIDUAL = 1e-4  # of a step's linear system, where conjugate gradients stop
+RESIDUAL = 1e-5  # of a step's linear system, where conjugate gradients stop
 # Or after so many: few, for far from the end an exact solution is no better. At small mu steps
 # achieve what they predict, and the last digits take many.
-FEW_STEPS, MANY_STEPS = 25, 100
+FEW_STEPS, MANY_STEPS = 32, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
