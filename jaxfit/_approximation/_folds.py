@@ -1,5 +1,7 @@
 """Where a surface folds during a fit: neighbouring samples whose normals turn away from one another."""
 
+from functools import reduce
+from operator import add, mul
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,25 +18,32 @@ SAMPLES, COSINE = 8, 0.5
 
 def folds_by_cell(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
     """The number of folds that begin in each cell. Places without a normal count as none."""
-    along = [_tangents(pieces, derivative) for derivative in (0, 1)]
-    size = jnp.sqrt(jnp.maximum(_facing(along, along), 0.0))
+    samples = jnp.stack([_tangents(pieces, 0), _tangents(pieces, 1)])
+    size = jnp.sqrt(jnp.maximum(_facing(samples, samples), 0.0))
 
-    def folded(axis: int) -> Float[Array, "a b"]:
-        def but(first: bool, x: Array) -> Array:
-            n = x.shape[axis - 2]
-            return lax.slice_in_dim(x, *((1, n) if first else (0, n - 1)), axis=x.ndim + axis - 2)
+    def number(axis: int) -> Float[Array, "a b"]:
+        """Folds between neighbours along u or v, the last of a cell and the first of the next included."""
 
-        here, there = ([but(first, x) for x in along] for first in (False, True))
-        turned = _facing(here, there) < COSINE * but(False, size) * but(True, size)
-        return jnp.pad(turned, [(0, int(k == axis)) for k in range(2)]).astype(size.dtype)
+        def neighbours(x: Array) -> tuple[Array, ...]:
+            inside, cells = x.ndim - 4 + axis, x.ndim - 2 + axis
+            first, last = (lax.slice_in_dim(x, k, k + 1, axis=inside) for k in (0, SAMPLES - 1))
+            count = x.shape[cells]
+            after = (
+                lax.slice_in_dim(first, 1, count, axis=cells),
+                lax.slice_in_dim(last, count - 1, count, axis=cells),
+            )
+            wide = lax.concatenate([x, lax.concatenate(after, cells)], inside)
+            return tuple(lax.slice_in_dim(wide, k, k + SAMPLES, axis=inside) for k in (0, 1))
 
-    number = folded(0) + folded(1)
-    cells_u, cells_v = pieces.axis_u.cells, pieces.axis_v.cells
-    return jnp.sum(number.reshape(cells_u, SAMPLES, cells_v, SAMPLES), axis=(1, 3))
+        here, there = neighbours(samples)
+        turned = _facing(here, there) < COSINE * reduce(mul, neighbours(size))
+        return jnp.sum(turned.astype(size.dtype), axis=(0, 1, 2, 3))
+
+    return number(0) + number(1)
 
 
-def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d a b"]:
-    """Tangents on all samples, in local coordinates: their length does not matter."""
+def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d m n cells_u cells_v"]:
+    """Tangents at samples (m, n) of all cells, in local coordinates: their length does not matter."""
     s = np.linspace(-1.0, 1.0, SAMPLES)
     tables: list[Any] = []
     for axis, order in enumerate(pieces.order):
@@ -43,16 +52,23 @@ def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d a b"]:
         if axis == direction:
             table = power * s[:, None] ** np.maximum(power - 1, 0)
         tables.append(jnp.asarray(table, pieces.coefficients.dtype))
-    at = jnp.einsum("cdab,ma,nb->dcmn", pieces.coefficients, *tables)
-    cells_u, cells_v = pieces.axis_u.cells, pieces.axis_v.cells
-    at = at.reshape(-1, cells_u, cells_v, SAMPLES, SAMPLES).transpose(0, 1, 3, 2, 4)
-    return at.reshape(-1, cells_u * SAMPLES, cells_v * SAMPLES)
+    # Cells come last, so that loops are long.
+    along_v = jnp.einsum("nb,cdab->danc", tables[1], pieces.coefficients)
+    at = jnp.einsum("ma,danc->dmnc", tables[0], along_v)
+    return at.reshape(*at.shape[:3], pieces.axis_u.cells, pieces.axis_v.cells)
 
 
-def _facing(here: list[Array], there: list[Array]) -> Float[Array, "a b"]:
+def _facing(
+    here: Float[Array, "2 d m n a b"], there: Float[Array, "2 d m n a b"]
+) -> Float[Array, "1 1 m n a b"]:
     """The product of two normals, by Lagrange's identity, which holds in every dimension."""
-    (a, b), (x, y) = here, there
-    return jnp.sum(a * x, 0) * jnp.sum(b * y, 0) - jnp.sum(a * y, 0) * jnp.sum(b * x, 0)
+
+    def products(x: Array, y: Array) -> Array:
+        # Written out: a reduction of so few numbers takes ten times as long on a CPU.
+        both = reduce(add, lax.split(x * y, (1,) * x.shape[1], 1))
+        return reduce(mul, lax.split(both, (1, 1), 0))
+
+    return products(here, there) - products(here, jnp.flip(there, 0))
 
 
 def near_folds(folds: Float[Array, "cells_u cells_v"], order: tuple[int, int]) -> Bool[Array, "nu nv"]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._damping import within_reach
+from jaxfit._approximation._damping import USUAL_DAMPING, within_reach
 from jaxfit._approximation._distance_rows import NormalEquations
 from jaxfit._normal_equations import (
     AbstractPenalty,
@@ -17,8 +17,10 @@ from jaxfit._normal_equations import (
     solve_coupled,
 )
 
-RESIDUAL = 1e-6  # of a step's linear system, where conjugate gradients stop, if MOST_STEPS do not end them
-MOST_STEPS = 60  # of conjugate gradients: as a rule all of them, so that rounding does not decide the number
+RESIDUAL = 1e-5  # of a step's linear system, where conjugate gradients stop
+# Or after so many: few, for far from the end an exact solution is no better. At small mu steps
+# achieve what they predict, and the last digits take many.
+FEW_STEPS, MANY_STEPS = 32, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
@@ -40,12 +42,16 @@ def gauss_newton_step(
     matrix = equations.matrix.plus(stiffness, 1.0)
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     scale = 1.0 + (net.shape[2] - 1) * damping
-    uncoupled = Stencil(equations.matrix.trace.entries / scale).plus(stiffness, 1.0)
-    free = free_points(uncoupled, held)
+    data = Stencil(equations.matrix.trace.entries / scale)
+    free = free_points(data.plus(stiffness, 1.0), held)
     right = equations.gradient - bent
     right = jnp.where(free[:, :, None], right, 0.0)
-    preconditioner = coupled_preconditioner(matrix, uncoupled, free)
+    # Data weighs 1 across the surface and mu along it, smoothing the same in all directions; factors for the
+    # geometric mean serve both.
+    between = Stencil(jnp.sqrt(damping) * data.entries).plus(stiffness, 1.0)
+    preconditioner = coupled_preconditioner(matrix, between, free)
     corrected = damping < 1
+    most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
     def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""
@@ -54,7 +60,7 @@ def gauss_newton_step(
             lambda: right,
             lambda: lax.cond(corrected, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
         )
-        solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, MOST_STEPS).net
+        solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, most).net
         limited = jnp.where(corrected, within_reach(net, solution, reach), solution)
         return jnp.where(is_step, limited, move), solution
 

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
 from jaxfit._normal_equations import NormalOperator, RegularisedSystem, Stencil, free_points, normal_solver
+from jaxfit._varying import varying_axes
 
 
 class LeastSquaresProblem(eqx.Module):
@@ -53,7 +54,7 @@ class AbstractLeastSquares(eqx.Module):
 
 
 class GaussNewton(AbstractLeastSquares):
-    """One Gauss-Newton step with the structured normal equations (the default).
+    """`optimistix.GaussNewton` with the structured normal equations as its linear solver (the default).
 
     The residual is linear, so one step solves it: moments of the points within cells, one Cholesky
     factorisation of the normal matrix (or CG for very large nets), one product with the transposed Jacobian.
@@ -67,9 +68,15 @@ class GaussNewton(AbstractLeastSquares):
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """One step."""
+        import optimistix as optx
+
         linear = StructuredSolver(problem)
-        step, _, _ = linear.compute(StructuredSolver.Side(), problem.residual(problem.net), {})
-        return _free_part(problem, problem.net - step), linear.shift
+        if varying_axes(problem.system.target):  # inside jax.shard_map, where optimistix cannot run
+            step, _, _ = linear.compute(StructuredSolver.Side(), problem.residual(problem.net), {})
+            return _free_part(problem, problem.net - step), linear.shift
+        # The residual is linear, so the first step is the solution: no norm and no acceptance test is needed.
+        solver: Any = optx.GaussNewton(1e-8, 1e-8, norm=lambda _: jnp.zeros(()), linear_solver=linear)
+        return _free_part(problem, _solution(solver, problem, 1).state.y_eval), linear.shift
 
 
 class LevenbergMarquardt(AbstractLeastSquares):

@@ -1,7 +1,7 @@
 """Preconditioned conjugate gradients on nets, for all solvers that are not direct."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -25,7 +25,7 @@ def conjugate_gradients(
     right: Float[Array, "nu nv c"],
     preconditioner: Operator,
     rtol: float,
-    max_steps: int,
+    max_steps: Any,
     coupled: bool,
 ) -> CGSolution:
     """Solves a positive semidefinite system from 0.

@@ -1,5 +1,7 @@
 """A preconditioner for coupled normal matrices: an uncoupled factor in rotated frames."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
@@ -54,7 +56,7 @@ def solve_coupled(
     free: Bool[Array, "nu nv"],
     preconditioner: CoupledPreconditioner,
     rtol: float,
-    max_steps: int,
+    max_steps: Any,
 ) -> CGSolution:
     """The solution on the free control points, 0 elsewhere, by conjugate gradients."""
     inside = free[:, :, None]
