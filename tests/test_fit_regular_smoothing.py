@@ -121,3 +121,16 @@ def test_folds_are_found_in_the_cell_they_are_in():
 def test_impossible_fields_get_a_sentence(fields, sentence):
     with pytest.raises(ValueError, match=sentence):
         jf.RegularSmoothing(**fields)
+
+
+def test_room_for_new_knots_changes_no_fit_before_they_are_there():
+    points, edges = wavy_cloud(200)
+    base = jf.base_surface(jf.Boundary(**edges), net=(7, 6))
+    insertion = jf.KnotInsertion(every=4)
+    fits = [
+        jf.approximate(points, base, jf.OrthogonalDistance(insertion=x), tol_average=1e-9, max_steps=6)
+        for x in (None, insertion)
+    ]
+    assert fits[1].surface.shape > base.shape
+    first, second = (np.asarray(fit.history.average)[:5] for fit in fits)
+    np.testing.assert_allclose(second, first, rtol=1e-6)

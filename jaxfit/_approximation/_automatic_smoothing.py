@@ -162,7 +162,7 @@ def evaluate_candidates(
 ) -> SmoothingCandidates:
     """All candidates for the correction of `net`; one factorisation for each."""
     data, plate = system.data_stencil(), system.plate.stencil()
-    free = free_points(data.plus(plate, 1.0), held)
+    free = free_points(data.plus(plate), held)
     mask = jnp.asarray(free)[:, :, None]
     traces = [jnp.sum(jnp.where(free, x.diagonal, 0.0)) for x in (data, plate)]
     tiny = jnp.finfo(net.dtype).tiny
@@ -177,7 +177,7 @@ def evaluate_candidates(
     normal = _normals(system, net) if d == 3 else None
 
     def one(value: Array) -> tuple[Array, Array]:
-        operator = NormalOperator(data.plus(plate, value), free, d + PROBES)
+        operator = NormalOperator(data.plus(plate.times(value)), free, d + PROBES)
         solver = BlockCholesky()
         right = jnp.concatenate([data_rhs + value * plate_rhs, probes], axis=2)
         solution, _, _ = solver.compute(solver.init(operator, {}), right, {})

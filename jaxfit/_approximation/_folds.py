@@ -19,30 +19,31 @@ SAMPLES, COSINE = 8, 0.5
 def folds_by_cell(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
     """The number of folds that begin in each cell. Places without a normal count as none."""
     samples = jnp.stack([_tangents(pieces, 0), _tangents(pieces, 1)])
-    size = jnp.sqrt(jnp.maximum(_facing(samples, samples), 0.0))
+    samples = samples.reshape(*samples.shape[:4], pieces.axis_u.cells, pieces.axis_v.cells)
+    area = _facing(samples, samples)
+    # In cells without width and at poles there is no normal, but rounding.
+    rounding = jnp.finfo(area.dtype).eps * jnp.max(area)
+    size = jnp.sqrt(jnp.maximum(area, 0.0))
 
-    def number(axis: int) -> Float[Array, "a b"]:
-        """Folds between neighbours along u or v, the last of a cell and the first of the next included."""
+    def folded(axis: int) -> Float[Array, "1 1 m n a b"]:
+        """Between a sample and the next one along u or v, in its cell or the next cell."""
 
-        def neighbours(x: Array) -> tuple[Array, ...]:
+        def following(x: Array) -> Array:
             inside, cells = x.ndim - 4 + axis, x.ndim - 2 + axis
-            first, last = (lax.slice_in_dim(x, k, k + 1, axis=inside) for k in (0, SAMPLES - 1))
             count = x.shape[cells]
-            after = (
-                lax.slice_in_dim(first, 1, count, axis=cells),
-                lax.slice_in_dim(last, count - 1, count, axis=cells),
-            )
-            wide = lax.concatenate([x, lax.concatenate(after, cells)], inside)
-            return tuple(lax.slice_in_dim(wide, k, k + SAMPLES, axis=inside) for k in (0, 1))
+            first, last = (lax.slice_in_dim(x, k, k + 1, axis=inside) for k in (0, SAMPLES - 1))
+            after = [lax.slice_in_dim(first, 1, count, axis=cells)]
+            after += [lax.slice_in_dim(last, count - 1, count, axis=cells)]
+            here = lax.slice_in_dim(x, 1, SAMPLES, axis=inside)
+            return jnp.concatenate([here, jnp.concatenate(after, cells)], inside)
 
-        here, there = neighbours(samples)
-        turned = _facing(here, there) < COSINE * reduce(mul, neighbours(size))
-        return jnp.sum(turned.astype(size.dtype), axis=(0, 1, 2, 3))
+        turned = _facing(samples, following(samples)) + rounding < COSINE * size * following(size)
+        return turned.astype(size.dtype)
 
-    return number(0) + number(1)
+    return jnp.sum(folded(0) + folded(1), axis=(0, 1, 2, 3))
 
 
-def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d m n cells_u cells_v"]:
+def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d m n cells"]:
     """Tangents at samples (m, n) of all cells, in local coordinates: their length does not matter."""
     s = np.linspace(-1.0, 1.0, SAMPLES)
     tables: list[Any] = []
@@ -54,8 +55,7 @@ def _tangents(pieces: Pieces, direction: int) -> Float[Array, "d m n cells_u cel
         tables.append(jnp.asarray(table, pieces.coefficients.dtype))
     # Cells come last, so that loops are long.
     along_v = jnp.einsum("nb,cdab->danc", tables[1], pieces.coefficients)
-    at = jnp.einsum("ma,danc->dmnc", tables[0], along_v)
-    return at.reshape(*at.shape[:3], pieces.axis_u.cells, pieces.axis_v.cells)
+    return jnp.einsum("ma,danc->dmnc", tables[0], along_v)
 
 
 def _facing(

@@ -39,16 +39,16 @@ def gauss_newton_step(
     damping 1 there is none.
     """
     stiffness, bent = penalty.system(net)
-    matrix = equations.matrix.plus(stiffness, 1.0)
+    matrix = equations.matrix.plus(stiffness)
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     scale = 1.0 + (net.shape[2] - 1) * damping
     data = Stencil(equations.matrix.trace.entries / scale)
-    free = free_points(data.plus(stiffness, 1.0), held)
+    free = free_points(data.plus(stiffness), held)
     right = equations.gradient - bent
     right = jnp.where(free[:, :, None], right, 0.0)
     # Data weighs 1 across the surface and mu along it, smoothing the same in all directions; factors for the
     # geometric mean serve both.
-    between = Stencil(jnp.sqrt(damping) * data.entries).plus(stiffness, 1.0)
+    between = data.times(jnp.sqrt(damping)).plus(stiffness)
     preconditioner = coupled_preconditioner(matrix, between, free)
     corrected = damping < 1
     most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)

@@ -64,7 +64,7 @@ class StandardBySums(StandardApproximation):
         """The least-squares net, by a correction of the present one."""
         surface, state = iterate.surface, iterate.state
         net, plate, sums = surface.control_points, plate_of(state.plate, surface), state.sums
-        stencil = sums.stencil.plus(plate.stencil(), state.smoothing)
+        stencil = sums.stencil.plus(plate.stencil().times(state.smoothing))
         free = free_points(stencil, self.held(surface))
         gradient = sums.gradient + state.smoothing * plate.adjoint(plate.residual(net))
         operator = NormalOperator(stencil, free, net.shape[2])

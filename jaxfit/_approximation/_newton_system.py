@@ -75,10 +75,10 @@ def newton_system(
     matrix = normal_equations(problem, surface.pieces, *feet, condition.weight, damping).matrix
     # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
     fixed = Stencil(matrix.trace.entries / (1.0 + (problem.target.shape[0] - 1) * damping))
-    between = Stencil(jnp.sqrt(damping) * fixed.entries)  # as in a step of the fit
+    between = fixed.times(jnp.sqrt(damping))  # as in a step of the fit
     if condition.penalty is not None:
         stiffness = condition.penalty.system(surface.control_points)[0]
-        matrix, fixed = matrix.plus(stiffness, 1.0), fixed.plus(stiffness, 1.0)
-        between = between.plus(stiffness, 1.0)
+        matrix, fixed = matrix.plus(stiffness), fixed.plus(stiffness)
+        between = between.plus(stiffness)
     free = free_points(fixed, condition.held)
     return NewtonSystem(coupled_preconditioner(matrix, between, free), fixed, free)

@@ -5,8 +5,6 @@ each point, have the normal matrix $\sum_k N_i N_j N_{i'} N_{j'} \Pi_k$. Each en
 its own, so this is one stencil for every pair of coordinates, from the same moments.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -38,10 +36,10 @@ class CoupledStencil(eqx.Module):
         diagonal = [self.entries[p, p] for p in range(self.entries.shape[0])]
         return Stencil(sum(diagonal[1:], diagonal[0]))
 
-    def plus(self, other: Stencil, factor: Any) -> "CoupledStencil":
-        """With `factor` times an uncoupled matrix added."""
+    def plus(self, other: Stencil) -> "CoupledStencil":
+        """With an uncoupled matrix added."""
         unit = jnp.eye(self.entries.shape[0], dtype=self.entries.dtype)[:, :, None, None, None, None]
-        return CoupledStencil(self.entries + unit * (factor * other.entries)[None, None])
+        return CoupledStencil(self.entries + unit * other.entries[None, None])
 
     def __call__(self, net: Float[Numbers, "nu nv d"]) -> Float[Array, "nu nv d"]:
         """The matrix times a net."""

@@ -37,7 +37,10 @@ LEAST_GAP = 1e-3  # of the mean distance; control points closer than that have n
 class _Differences(eqx.Module):
     """Along one direction: weights of the control points i - 1, i, i + 1 in the first and the second
     difference at i, and of i in the difference from i to i + 1. Second differences at the ends are 0.
+    `present` is 1, and 0 for surplus control points.
     """
+
+    present: Float[Numbers, " n"]
 
     first: Float[Numbers, "3 n"]
     second: Float[Numbers, "3 n"]
@@ -68,6 +71,9 @@ class Roughness(AbstractPenalty):
         nu, nv = net.shape[:2]
         order = knots_u.shape[0] - nu, knots_v.shape[0] - nv
         along_u, along_v = (_differences(x, k) for x, k in zip((knots_u, knots_v), order, strict=True))
+        present = jnp.asarray(along_u.present)[:, None] * jnp.asarray(along_v.present)[None, :]
+        # So surplus control points have neither tangents nor second differences.
+        factor, net = present * factor, present[:, :, None] * net
         per_u = _inverse_square(_apply(along_u.first, net))
         per_v = _inverse_square(_swap(_apply(along_v.first, _swap(net))))
         weights = NetSquares(factor * per_u, _at_corners(factor) * _at_corners(per_u + per_v), factor * per_v)
@@ -106,8 +112,8 @@ def _differences(knots: Any, order: int) -> _Differences:
     """For the Greville abscissae of these knots; surplus control points have no differences."""
     places = greville(knots, order)
     xp: Any = np if is_concrete(knots) else jnp
-    gaps = places[1:] - places[:-1]
-    mean = (places[-1] - places[0]) / xp.maximum(xp.sum(gaps > 0), 1)  # of those that are not surplus
+    last, gaps = places[-1], places[1:] - places[:-1]
+    mean = (last - places[0]) / xp.maximum(xp.sum(gaps > 0), 1)  # of those that are not surplus
     apart = gaps > LEAST_GAP * mean
     inverse = xp.where(apart, mean / xp.where(apart, gaps, 1.0), 0.0)
     before, after = inverse[:-1], inverse[1:]
@@ -118,7 +124,8 @@ def _differences(knots: Any, order: int) -> _Differences:
     left, right = xp.pad(inverse, (1, 0)), xp.pad(inverse, (0, 1))
     sides = xp.maximum((left > 0).astype(places.dtype) + (right > 0), 1.0)
     first = xp.stack([-left, left - right, right]) / sides[None]
-    return _Differences(first, second, xp.sqrt(inverse))
+    present = xp.pad((places[:-1] < last).astype(places.dtype), (1, 0), constant_values=1.0)
+    return _Differences(present, first, second, xp.sqrt(inverse))
 
 
 def _apply(weights: Any, net: Float[Array, "n m d"]) -> Float[Array, "n m d"]:

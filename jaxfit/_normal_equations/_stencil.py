@@ -37,9 +37,13 @@ class Stencil(eqx.Module):
         channels = jnp.moveaxis(jnp.asarray(net), 2, 0)[None]
         return jnp.moveaxis(shifted_products(self.entries[None, None], channels), 0, 2)
 
-    def plus(self, other: "Stencil", factor: Any) -> "Stencil":
-        """The sum of this and `factor` times the other."""
-        return Stencil(self.entries + factor * other.entries)
+    def plus(self, other: "Stencil") -> "Stencil":
+        """The sum of both."""
+        return Stencil(self.entries + other.entries)
+
+    def times(self, factor: Any) -> "Stencil":
+        """The matrix times a number."""
+        return Stencil(factor * self.entries)
 
     def transposed(self) -> "Stencil":
         """The same matrix on the net with its directions exchanged."""

@@ -53,7 +53,7 @@ class RegularisedSystem(eqx.Module):
 
     def stencil(self) -> Stencil:
         """The normal matrix A^T W A + lambda A_fair of (11)."""
-        return self.data_stencil().plus(self.plate.stencil(), self.smoothing)
+        return self.data_stencil().plus(self.plate.stencil().times(self.smoothing))
 
     def data_residual(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
         """sqrt(w) (A P - Q)."""
