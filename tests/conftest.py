@@ -3,6 +3,7 @@
 `--float32` is the second pass: x64 off, and only the tests marked `float32_too`.
 """
 
+import gc
 import os
 import subprocess
 import sys
@@ -51,6 +52,14 @@ def pytest_configure(config):
     jax.config.update("jax_numpy_rank_promotion", "raise")
     # Most of the session is compiling tiny problems; unoptimised code is as correct and compiles faster.
     jax.config.update("jax_disable_most_optimizations", True)
+    # Tracing makes many small objects that live as long as their program. Python looks for cycles among them
+    # after every 700; and compiled code needs no note of the source lines that it comes from.
+    gc.set_threshold(50_000, 20, 50)
+    jax.config.update("jax_traceback_in_locations_limit", 0)
+
+
+def pytest_collection_finish(session):
+    gc.freeze()  # what is imported lives as long as the session
 
 
 def pytest_collection_modifyitems(config, items):

@@ -1,5 +1,7 @@
 """Derivatives of fits of clouds, beside central differences of the public call."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,19 +116,18 @@ def test_the_derivative_is_that_of_the_polished_fit(name):
 
 
 BASE = base_of((6, 7), (4, 4))
+# Two of the cases, whose programs are there.
+REGULAR, PLATE = (CASES[name][0](CASES[name][1]) for name in ("default", "new knots"))
 
 
-PLATE = jf.OrthogonalDistance(smoothing=1e-5)
-
-
-def plate_height(points, weights, adjoint=None, max_steps=40):
+def height_of(points, weights, adjoint=None, max_steps=40, method=REGULAR):
     options = dict(tol_average=1e-12, max_steps=max_steps, weights=weights, adjoint=adjoint)
-    fit = jf.approximate(points, BASE, PLATE, **options)
+    fit = jf.approximate(points, BASE, method, **options)
     return jnp.sum(fit.surface(*PLACES) * FACTORS)
 
 
 def test_gradients_run_in_jit_and_vmap():
-    slope = jax.grad(plate_height, argnums=(0, 1))
+    slope = jax.grad(height_of, argnums=(0, 1))
     single = slope(POINTS, WEIGHTS)
     clouds = jnp.stack([POINTS, POINTS * 1.01])
     batch = jax.jit(jax.vmap(slope, (0, None)))(clouds, WEIGHTS)
@@ -139,7 +140,7 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
     outside = np.array([[-0.1, -0.1, 0.0], [0.5, -0.05, 0.02]])
     points = np.concatenate([POINTS[:192], special, outside, POINTS[:1], POINTS[:1]])
     weights = np.concatenate([WEIGHTS[:192], np.ones(7), [0.0]])
-    gradient = jax.grad(plate_height, argnums=(0, 1))(points, weights)
+    gradient = jax.grad(partial(height_of, method=PLATE), argnums=(0, 1))(points, weights)
     assert all(np.isfinite(x).all() for x in gradient)
     direction = np.zeros(points.shape)
     direction[192:] = np.random.default_rng(0).normal(size=(8, 3))
@@ -147,7 +148,7 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
     direction[192:196] = 0.0  # on the border, where the derivative is one-sided
 
     def polished(*x):
-        return plate_height(*x, adjoint=AT_ROUNDING)
+        return height_of(*x, adjoint=AT_ROUNDING, method=PLATE)
 
     difference = central_difference(polished, (points, weights), 0, direction, 1e-7)
     np.testing.assert_allclose(jnp.sum(gradient[0] * direction), difference, rtol=1e-6, atol=1e-7)
@@ -167,7 +168,7 @@ def test_a_surface_that_is_not_at_rest_says_so():
 
 def test_a_derivative_far_from_rest_is_refused():
     def slope(adjoint):
-        return jax.grad(plate_height, argnums=(0, 1))(POINTS, WEIGHTS, adjoint, max_steps=1)[0]
+        return jax.grad(height_of, argnums=(0, 1))(POINTS, WEIGHTS, adjoint, max_steps=1)[0]
 
     with pytest.raises(ArithmeticError, match=r"not at rest .* pass a number as smoothing"):
         slope(jf.ImplicitAdjoint(polish_steps=0))
@@ -199,7 +200,7 @@ def test_a_cloud_with_its_boundary_is_differentiable_in_its_points_and_weights()
     boundary = jf.Boundary(**EDGES)
 
     def height(points, weights, adjoint=None):
-        options = dict(net=(6, 7), method=PLATE, tol_average=1e-12, max_steps=40, base=jf.Coons())
+        options = dict(net=(6, 7), method=REGULAR, tol_average=1e-12, max_steps=40, base=jf.Coons())
         fit = jf.fit_points(points, boundary, **options, weights=weights, adjoint=adjoint)
         return jnp.sum(fit.surface(*PLACES) * FACTORS)
 

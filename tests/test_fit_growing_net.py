@@ -51,7 +51,8 @@ def test_noise_ends_the_growth_and_is_not_followed():
     assert fit.result == jf.RESULTS.noise_reached
     assert "held out" in fit.message
     away = np.asarray(jf.closest_point(fit.surface, CLEAN).distance).mean() / size
-    fixed = [jf.fit_points(noisy, BOUNDARY, net=(n, n), tol_average=1e-6, max_steps=20) for n in (10, 24)]
+    nets = (10, 10), (20, 19)  # the finer one is that of all fits of so many points that do not grow
+    fixed = [jf.fit_points(noisy, BOUNDARY, net=n, tol_average=1e-6, max_steps=20) for n in nets]
     others = [np.asarray(jf.closest_point(x.surface, CLEAN).distance).mean() / size for x in fixed]
     assert away < 1.35 * min(others)  # measured: 1.32
     assert away < 0.4 * noise
@@ -75,8 +76,9 @@ def test_few_points_and_other_wishes_keep_one_net():
 
 
 def test_points_of_weight_zero_choose_no_net():
-    astray = np.concatenate([CLEAN, CLEAN[::10] + np.array([[0.0, 0.0, 0.5]])])
-    weights = np.concatenate([np.ones(COUNT), np.zeros(COUNT // 10)])
+    # So few that they share the programs of the other fits.
+    astray = np.concatenate([CLEAN, CLEAN[::42] + np.array([[0.0, 0.0, 0.5]])])
+    weights = np.repeat([1.0, 0.0], [COUNT, len(astray) - COUNT])
     fit = jf.fit_points(astray, BOUNDARY, tol_average=1e-4, weights=weights)
     assert fit.converged
     assert fit.surface.shape < (26, 26)

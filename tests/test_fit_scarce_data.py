@@ -61,9 +61,9 @@ def test_all_ways_to_solve_leave_the_same_control_points_alone():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_single_weight_leaves_the_rest_of_the_base(method):
-    points, weights = cloud(400), np.zeros(400)
+    points, weights = cloud(300), np.zeros(300)
     weights[7] = 1.0
-    fit = jf.approximate(points, flat_base(8), method(smoothing=0.0), weights=weights, max_steps=20)
+    fit = jf.approximate(points, flat_base(12), method(smoothing=0.0), weights=weights, max_steps=20)
     assert np.abs(fit.surface.control_points).max() < 5
     assert fit.average_error < 0.1
 
