@@ -13,7 +13,7 @@ import jaxfit.io
 import jaxfit.plot
 
 TOP = Path(__file__).resolve().parent.parent
-COPIED = ("README.md", "LICENSE", "notebooks/*.png", "benchmarks/*.md", "benchmarks/results/*.md")
+COPIED = ("README.md", "LICENSE", "notebooks/*.png", "benchmarks/*.md", "benchmarks/results/*.*")
 
 # Every room with public names stands on one page, or the build ends with a KeyError.
 PAGES = {
