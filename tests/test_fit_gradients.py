@@ -21,6 +21,7 @@ AT_ROUNDING = jf.ImplicitAdjoint(residual=0.0)
 # Each with a number, and the net and the order of the base surface. Other tests fit 200 points with weights
 # and a net of (6, 7) too: so they share programs.
 CASES = {
+    "plate": (lambda x: jf.OrthogonalDistance(smoothing=x), 1e-5, (6, 7), (4, 4)),
     "default": (lambda x: jf.OrthogonalDistance(jf.RegularSmoothing(least=x)), 5.0, (6, 7), (4, 4)),
     "robust, free": (
         lambda x: jf.OrthogonalDistance(smoothing=x, loss=jf.Huber(), border=jf.FreeBorder()),
