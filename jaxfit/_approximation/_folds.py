@@ -21,7 +21,7 @@ def folds_by_cell(pieces: Pieces) -> Float[Array, "cells_u cells_v"]:
     samples = jnp.stack([_tangents(pieces, 0), _tangents(pieces, 1)])
     samples = samples.reshape(*samples.shape[:4], pieces.axis_u.cells, pieces.axis_v.cells)
     area = _facing(samples, samples)
-    # In cells without width and at poles there is no normal, but rounding.
+    # Where tangents are parallel or vanish, at poles and in cells without width, this is rounding.
     rounding = jnp.finfo(area.dtype).eps * jnp.max(area)
     size = jnp.sqrt(jnp.maximum(area, 0.0))
 

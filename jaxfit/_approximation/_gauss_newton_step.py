@@ -11,7 +11,6 @@ from jaxfit._approximation._damping import USUAL_DAMPING, within_reach
 from jaxfit._approximation._distance_rows import NormalEquations
 from jaxfit._normal_equations import (
     AbstractPenalty,
-    Stencil,
     coupled_preconditioner,
     free_points,
     solve_coupled,
@@ -40,9 +39,7 @@ def gauss_newton_step(
     """
     stiffness, bent = penalty.system(net)
     matrix = equations.matrix.plus(stiffness)
-    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
-    scale = 1.0 + (net.shape[2] - 1) * damping
-    data = Stencil(equations.matrix.trace.entries / scale)
+    data = equations.matrix.at_fixed_parameters(damping)
     free = free_points(data.plus(stiffness), held)
     right = equations.gradient - bent
     right = jnp.where(free[:, :, None], right, 0.0)

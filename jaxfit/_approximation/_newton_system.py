@@ -73,8 +73,7 @@ def newton_system(
     damping = jnp.minimum(DAMPING + shift, 1.0) if method.finds_feet else 1.0
     damping = jnp.asarray(damping, error.dtype)
     matrix = normal_equations(problem, surface.pieces, *feet, condition.weight, damping).matrix
-    # Of a point's d directions one is a normal; so scaled the trace is the matrix of fixed parameters.
-    fixed = Stencil(matrix.trace.entries / (1.0 + (problem.target.shape[0] - 1) * damping))
+    fixed = matrix.at_fixed_parameters(damping)
     between = fixed.times(jnp.sqrt(damping))  # as in a step of the fit
     if condition.penalty is not None:
         stiffness = condition.penalty.system(surface.control_points)[0]

@@ -5,6 +5,8 @@ each point, have the normal matrix $\sum_k N_i N_j N_{i'} N_{j'} \Pi_k$. Each en
 its own, so this is one stencil for every pair of coordinates, from the same moments.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,13 @@ class CoupledStencil(eqx.Module):
         """The sum over all coordinates with themselves."""
         diagonal = [self.entries[p, p] for p in range(self.entries.shape[0])]
         return Stencil(sum(diagonal[1:], diagonal[0]))
+
+    def at_fixed_parameters(self, damping: Any) -> Stencil:
+        """Of rows blended by mu, `damping`, with those at fixed parameters, the matrix of the latter.
+
+        The trace has 1 + (d - 1) mu times that: of a point's d directions one is a normal.
+        """
+        return Stencil(self.trace.entries / (1.0 + (self.entries.shape[0] - 1) * damping))
 
     def plus(self, other: Stencil) -> "CoupledStencil":
         """With an uncoupled matrix added."""
