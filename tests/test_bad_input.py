@@ -341,8 +341,7 @@ def test_an_interrupted_command_is_quiet(tmp_path, seconds):
     imports = tmp_path.with_suffix(".imports")
     with imports.open("w") as file:
         running = subprocess.Popen(
-            [sys.executable, "-X", "importtime", "-m", "jaxfit", "fit", "grid.npz"]
-            + ["-o", "s.npz", "--no-cache"],
+            f"{sys.executable} -X importtime -m jaxfit fit grid.npz -o s.npz --no-cache".split(),
             cwd=tmp_path,
             env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
             stdout=subprocess.PIPE,

@@ -9,7 +9,13 @@ from helpers import data, diagonal, eps, wavy_cloud
 from normal_reference import thin_plate_matrix
 
 import jaxfit as jf
-from jaxfit._approximation._damping import LEAST_DAMPING, DampingState, next_damping, within_reach
+from jaxfit._approximation._damping import (
+    LEAST_DAMPING,
+    DampingState,
+    longest_moves,
+    next_damping,
+    within_reach,
+)
 from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._fit._problem import Tolerances, make_problem
@@ -196,7 +202,7 @@ def test_damping_follows_the_fall_that_was_predicted(base):
 def test_moves_reach_no_farther_than_a_share_of_the_spacing():
     net = jnp.asarray(np.random.default_rng(0).normal(size=(6, 5, 3)))
     move = jnp.zeros_like(net).at[2, 2].set(100.0).at[3, 3].set(1e-3)
-    cut = np.asarray(within_reach(net, move, 0.6))
+    cut = np.asarray(within_reach(move, longest_moves(net, 0.6, net.shape[:2])))
     around = [np.linalg.norm(net[2, 2] - net[i, j]) for i, j in ((1, 2), (3, 2), (2, 1), (2, 3))]
     limit = 0.6 * min(np.mean(around[:2]), np.mean(around[2:]))
     assert np.isclose(np.linalg.norm(cut[2, 2]), limit)

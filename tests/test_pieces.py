@@ -72,6 +72,8 @@ def test_unused_control_points_of_a_fixed_capacity_net_change_nothing():
     u, v = np.random.default_rng(1).uniform(size=(2, 20))
     u[0] = v[0] = 1.0
     np.testing.assert_allclose(jet_at(pieces, u, v)["value"], surface(u, v), atol=1e-14)
+    behind = np.asarray(pieces.coefficients).reshape(pieces.axis_u.cells, pieces.axis_v.cells, 3, 4, -1)[-3:]
+    assert (behind[:, :, :, 1:] == 0).all()
 
 
 def test_a_curve_is_a_surface_of_one_cell_across():

@@ -1,7 +1,7 @@
 """`fit_cloud`: one fit of a cloud, from checked arguments to its result."""
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,12 +36,24 @@ from jaxfit._splines import BSplineSurface
 LEAST_POINTS = 4
 
 
+class Room(NamedTuple):
+    """What a fit has room for: fits with the same room are one program."""
+
+    net: tuple[int, int]
+    steps: int
+
+
 def fit_cloud(
-    points: ArrayLike, base: BSplineSurface, method: AbstractIterativeMethod, request: dict[str, Any]
+    points: ArrayLike,
+    base: BSplineSurface,
+    method: AbstractIterativeMethod,
+    request: dict[str, Any],
+    room: Room | None = None,
 ) -> Fit:
     """`approximate`, its options in a dictionary.
 
-    The fit runs on its arguments without their derivatives, which are concrete under `grad` alone.
+    The fit runs on its arguments without their derivatives, which are concrete under `grad` alone. Without
+    `room` it has no more than it needs.
     """
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
@@ -58,6 +70,9 @@ def fit_cloud(
     tolerances = tolerances_of(*goals, max_steps)
     problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
     begun = working_surface(base, unit, concrete)
+    nu, nv = base.shape
+    if room is not None:
+        begun = begun.padded(room.net[0] - nu, room.net[1] - nv)
     if feet is None:
         nearest = closest_point(base, cloud)
         feet = nearest.u, nearest.v
@@ -66,9 +81,9 @@ def fit_cloud(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
-    nu, nv = base.shape
     doing(f"fitting {nu} x {nv} control points to {cloud.shape[0]:,} points")
-    loop = begin(method, together, begun, u[order], v[order], max_steps)
+    entries = max_steps if room is None else room.steps
+    loop = begin(method, together, begun, u[order], v[order], entries)
     loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = fitted_surface(loop.current.surface, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
@@ -190,13 +205,14 @@ def fitted_surface(
     Inside transformations a net with room for knots keeps its surplus control points.
     """
     concrete = is_concrete(end, base)
-    if concrete and end.control_points.shape != begun.control_points.shape:
+    if concrete and end.control_points.shape != base.control_points.shape:
         end = end.trimmed()
     dtype = base.control_points.dtype
     xp: Any = np if concrete else jnp  # NumPy compiles nothing
     moved = xp.asarray(unit.outward(end.control_points), dtype)
     if moved.shape == base.control_points.shape:
-        still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)
+        nu, nv = base.shape
+        still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)[:nu, :nv]
         moved = xp.where(still, xp.asarray(base.control_points), moved)
     parts = moved, xp.asarray(end.knots_u, dtype), xp.asarray(end.knots_v, dtype)
     return BSplineSurface(*(jax.device_put(parts) if concrete else parts))

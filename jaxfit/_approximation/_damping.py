@@ -67,22 +67,25 @@ def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Arra
     return jnp.max(jnp.where(counts, jnp.maximum(*ways), 0.0))
 
 
-def within_reach(
-    net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"], reach: Any
-) -> Float[Array, "nu nv d"]:
-    """Moves limited to a share of the distance to the nearer neighbours in the net.
+def longest_moves(net: Float[Array, "nu nv d"], reach: Any, used: Any) -> Float[Array, "nu nv"]:
+    """How far each control point may move: a share of the distance to its nearer neighbours in the net.
 
-    The linear model of the residuals does not hold for moves that fold the net.
+    The linear model of the residuals does not hold for moves that fold the net. Surplus control points,
+    which are behind the `used` ones, are nobody's neighbours.
     """
+    return reach * jnp.minimum(_spacing(net, used[0]), _spacing(net.transpose(1, 0, 2), used[1]).T)
+
+
+def within_reach(move: Float[Array, "nu nv d"], longest: Float[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
+    """The move of each control point, no longer than it may be."""
     length = jnp.sqrt(jnp.sum(move**2, axis=-1))
-    limit = reach * jnp.minimum(_spacing(net), _spacing(net.transpose(1, 0, 2)).T)
-    far = length > limit
-    share = jnp.where(far, limit / jnp.where(far, length, 1.0), 1.0)
-    return share[:, :, None] * move
+    far = length > longest
+    return jnp.where(far, longest / jnp.where(far, length, 1.0), 1.0)[:, :, None] * move
 
 
-def _spacing(net: Float[Array, "n m d"]) -> Float[Array, "n m"]:
+def _spacing(net: Float[Array, "n m d"], used: Any) -> Float[Array, "n m"]:
     """Mean distance to the neighbours along the first direction."""
     legs = jnp.sqrt(jnp.sum(jnp.diff(net, axis=0) ** 2, axis=-1))
     before, after = jnp.concatenate([legs[:1], legs]), jnp.concatenate([legs, legs[-1:]])
-    return 0.5 * (before + after)
+    last = np.arange(net.shape[0])[:, None] == used - 1
+    return 0.5 * (before + jnp.where(last, before, after))

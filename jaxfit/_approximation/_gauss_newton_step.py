@@ -1,7 +1,6 @@
 """One step of `OrthogonalDistance`: a damped Gauss-Newton step and its second-order correction."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -25,17 +24,17 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 def gauss_newton_step(
     penalty: AbstractPenalty,
-    reach: Any,
     correction_rhs: Callable[[Array, Array], Array],
     equations: NormalEquations,
     net: Float[Array, "nu nv d"],
     held: Bool[Array, "nu nv"],
+    longest: Float[Array, "nu nv"],
     damping: Float[Array, ""],
 ) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
     """The net after the step, and the predicted reduction of the objective.
 
     `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
-    damping 1 there is none.
+    damping 1 there is none, and moves may be longer than `longest`.
     """
     stiffness, bent = penalty.system(net)
     matrix = equations.matrix.plus(stiffness)
@@ -58,12 +57,12 @@ def gauss_newton_step(
             lambda: lax.cond(corrected, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
         )
         solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, most).net
-        limited = jnp.where(corrected, within_reach(net, solution, reach), solution)
+        limited = jnp.where(corrected, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 
     move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
-    whole = within_reach(net, move + _at_most(LARGEST_CORRECTION, correction, move), reach)
+    whole = within_reach(move + _at_most(LARGEST_CORRECTION, correction, move), longest)
     return net + jnp.where(corrected, whole, move), predicted
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._approximation._cloud_fit import fit_cloud
+from jaxfit._approximation._cloud_fit import Room, fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._level_nets import AbstractNets
 from jaxfit._fit._reasons import RESULTS
@@ -24,6 +24,9 @@ POINTS_A_CONTROL_POINT = 3  # at least, of any net
 # A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
 # POINTS_TO_CHOOSE for each control point.
 ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
+# Nets share a program where each direction has room for the same number of control points: compiling costs
+# more than the surplus ones.
+ROOMS = 24, 48, 96, MOST_SIZE
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
@@ -57,6 +60,13 @@ class NetGrowth:
         """Control points along u and v."""
         return self.nets.net(size, MOST_SIZE)
 
+    def fit(self, points: Any, base: BSplineSurface, request: dict[str, Any]) -> Fit:
+        """The fit of `points`, in a program for nets of similar size and for any number of iterations."""
+        net = [next((room for room in ROOMS if room >= n), n) for n in base.shape]
+        return fit_cloud(
+            points, base, self.method, request, Room((net[0], net[1]), self.request["max_steps"])
+        )
+
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
         best, before, size = None, None, FIRST_SIZE
@@ -85,7 +95,7 @@ class NetGrowth:
             "throw": False,
             "errors": LocalFeet(),
         }
-        fit = fit_cloud(self.points[some], base, self.method, request)
+        fit = self.fit(self.points[some], base, request)
         return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()))
 
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
@@ -114,14 +124,14 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
     request["start"] = growth.nets.feet(growth.net(size))
-    fit = fit_cloud(growth.points, level.fit.surface, growth.method, request)
+    fit = growth.fit(growth.points, level.fit.surface, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= LEAST_GROWTH
         if bool(fit.converged) or size > growth.most:
             break
         net = growth.net(size)
         request["start"] = growth.nets.feet(net)
-        fit = fit_cloud(growth.points, growth.nets.carried(fit.surface, net), growth.method, request)
+        fit = growth.fit(growth.points, growth.nets.carried(fit.surface, net), request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit

@@ -18,6 +18,7 @@ from jaxfit._approximation._damping import (
     farthest_move,
     first_damping,
     is_plausible,
+    longest_moves,
     next_damping,
 )
 from jaxfit._approximation._distance_rows import normal_equations
@@ -288,9 +289,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
             return problem.total(own)
 
         def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
-            return gauss_newton_step(penalty, self.reach, correction_rhs, *x)
+            return gauss_newton_step(penalty, correction_rhs, *x)
 
-        following, predicted = materialise(always, solve, penalty, equations, net, held, damping)
+        longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
+        following, predicted = materialise(always, solve, penalty, equations, net, held, longest, damping)
         lost = jnp.isnan(state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
         damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)

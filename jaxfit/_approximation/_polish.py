@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._approximation._damping import within_reach
+from jaxfit._approximation._damping import longest_moves
 from jaxfit._approximation._newton_system import newton_system
 from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
@@ -102,7 +102,9 @@ def polished(
 
         def step() -> tuple[Array, Array]:
             system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
-            move = _shortened(now.trial, system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES))
+            move = _shortened(
+                surface.moved_to(now.trial), system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES)
+            )
             return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
 
         done = good & ((new.size <= least) | (now.steps >= most))
@@ -131,10 +133,13 @@ def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:
     return jnp.where(now.again, now.shift, jnp.where(good, fallen, taken_back))
 
 
-def _shortened(net: Float[Array, "nu nv d"], move: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
+def _shortened(surface: WorkingSurface, move: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
     """The move, shorter where a control point would come too near to its neighbours."""
-    length, limit = (jnp.sqrt(jnp.sum(x**2, axis=-1)) for x in (move, within_reach(net, move, REACH)))
-    return move * jnp.min(jnp.where(length > limit, limit / jnp.where(length > 0, length, 1.0), 1.0))
+    length, longest = (
+        jnp.sqrt(jnp.sum(move**2, axis=-1)),
+        longest_moves(surface.control_points, REACH, surface.used),
+    )
+    return move * jnp.min(jnp.where(length > longest, longest / jnp.where(length > 0, length, 1.0), 1.0))
 
 
 def _measured(

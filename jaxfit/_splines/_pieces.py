@@ -137,6 +137,9 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
         # The filled cell on the other side of a crease; empty spans may lie between.
         before = _where(first > first[:1], windows(left, xp.maximum(first - 1, 0), 1)[0], number)
         after = _where(last < last[-1:], windows(right, xp.minimum(last + 1, cells - 1), 1)[0], number)
+    # Empty spans are points: as polynomials they would go on beyond the knots.
+    wanted = filled[:, None, None] | (np.arange(order) == 0)[None, None]
+    polynomials = span_polynomials(knots, centre, half, order) * wanted
     bounds = xp.stack([windows(low, first, 1)[0], windows(high, last, 1)[0], centre, half])
     return Axis(
         breaks=breaks.astype(dtype),
@@ -146,7 +149,7 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
         ends=ends,
         before=before,
         after=after,
-        polynomials=span_polynomials(knots, centre, half, order).astype(dtype),
+        polynomials=polynomials.astype(dtype),
         creased=creased,
     )
 
@@ -171,7 +174,7 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
     """Non-zero basis functions of every span as polynomials, M[span, r, a] of s^a, s in [-1, 1].
 
     The Cox-de Boor recursion, (2)-(3) in the paper, carried out on coefficients for all r and spans at once:
-    each of its factors is a polynomial of degree one in s. Empty spans give finite values that nothing uses.
+    each of its factors is a polynomial of degree one in s. What empty spans give has no meaning.
     """
     concrete, spans = is_concrete(knots, centre, half), centre.shape[0]
     basis: Any = np.zeros((order, order, spans), knots.dtype)  # r, a, span
