@@ -77,7 +77,7 @@ def test_a_trimmed_fit_has_a_page_with_all_pictures(tmp_path):
         np.__version__,
     ):
         assert said in page.cells
-    assert len(page.images) == 4
+    assert len(page.images) == 5  # surface and errors are two
     for image in page.images:
         kind, data = image["src"].split(",")
         assert kind == "data:image/png;base64"

@@ -89,6 +89,15 @@ def surface_and_errors(
     return figure
 
 
+def surface_beside_errors(fit: Any, points: ArrayLike | None = None) -> tuple["Figure", "Figure"]:
+    """The two sides of `surface_and_errors` as pictures of their own."""
+    errors = _arrange(fit.errors, points)
+    left, right = blank_figure(7), blank_figure(7)
+    view = _draw_surface(left.subplots(), fit)
+    _draw_errors(right.subplots(), fit, 100 * errors, view)
+    return left, right
+
+
 def _arrange(errors: ArrayLike, points: ArrayLike | None) -> np.ndarray:
     errors = np.asarray(errors, dtype=float)
     if points is None or np.ndim(points) != 3 or errors.ndim == 2:

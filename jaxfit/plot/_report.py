@@ -17,7 +17,7 @@ from jaxfit.io._output import write_atomically
 from jaxfit.plot._history import history
 from jaxfit.plot._loops import loops
 from jaxfit.plot._part import of_fit
-from jaxfit.plot._picture import surface_and_errors
+from jaxfit.plot._picture import surface_beside_errors
 from jaxfit.plot._zebra import zebra_stripes
 
 _DPI = 110
@@ -34,8 +34,9 @@ h1 {{ font-size: 1.5rem; overflow-wrap: anywhere; }}
 h2 {{ font-size: 1.15rem; margin: 2rem 0 0.5rem; border-bottom: 1px solid #ddd; }}
 table {{ border-collapse: collapse; width: 100%; }}
 th, td {{ text-align: left; vertical-align: top; padding: 0.2rem 0.8rem 0.2rem 0; overflow-wrap: anywhere; }}
-th {{ font-weight: 600; width: 30%; }}
-figure {{ margin: 1rem 0; }}
+th {{ font-weight: 600; width: 30%; min-width: 6.5rem; overflow-wrap: normal; }}
+figure {{ margin: 1rem 0; flex: 1 1 22rem; }}
+.row {{ display: flex; flex-wrap: wrap; column-gap: 1rem; }}
 img {{ display: block; max-width: 100%; height: auto; margin: 0 auto; }}
 figcaption {{ color: #555; font-size: 0.9rem; }}
 </style>
@@ -58,8 +59,9 @@ def report(
 ) -> None:
     """Write one page of HTML about a fit: result, pictures and versions, without requests to anywhere.
 
-    Pictures are those of `surface_and_errors` (with folds), `zebra_stripes` of a surface in space, `loops`
-    and `history`, inside the page. The page can be read on a telephone.
+    Pictures are those of `surface_and_errors` (with folds), one beside the other where the window is wide
+    enough, `zebra_stripes` of a surface in space, `loops` and `history`, inside the page. The page can be
+    read on a telephone.
 
     Parameters
     ----------
@@ -98,27 +100,26 @@ def report(
         "Result": {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)},
     }
     parts = [_table(heading, values) for heading, values in rows.items()]
-    parts += [_figure(*picture) for picture in _pictures(fit, points)]
+    parts += [_figures(*pictures) for pictures in _pictures(fit, points)]
     parts.append(_table("Versions", _versions(version)))
     page = _PAGE.format(title=html.escape(title), body="\n".join(parts))
     write_atomically(path, page.encode())
 
 
-def _pictures(fit: Any, points: Any) -> list[tuple[str, Any, str]]:
-    """Heading, figure and caption of each."""
-    folds = "Folds are red on the surface and crosses over the parameters."
+def _pictures(fit: Any, points: Any) -> list[tuple[str, list[tuple[Any, str]]]]:
+    """Headings, each with figures and their captions."""
+    surface, errors = surface_beside_errors(fit, points)
     trimmed = getattr(fit, "trimmed", None)
-    pictures = [
-        ("Errors and folds", surface_and_errors(fit, points), f"Distances of the points. {folds}"),
-    ]
+    both = [(surface, "The surface. Folds are red."), (errors, "Distances of the points. Folds are crosses.")]
+    pictures = [("Errors and folds", both)]
     if fit.surface.dimension == 3:
         stripes = "Lights reflected in the surface: where they kink or wiggle, so does it."
-        pictures.append(("Zebra stripes", zebra_stripes(of_fit(fit)), stripes))
+        pictures.append(("Zebra stripes", [(zebra_stripes(of_fit(fit)), stripes)]))
     if trimmed is not None or np.ndim(fit.errors) == 1:
         where = "Feet of the points in the domain, and its knots"
         caption = f"{where}, with the outer loop (full) and holes (dashed)." if trimmed else f"{where}."
-        pictures.append(("Loops" if trimmed else "Parameters", loops(fit), caption))
-    pictures.append(("History", history(fit), "Errors after every iteration."))
+        pictures.append(("Loops" if trimmed else "Parameters", [(loops(fit), caption)]))
+    pictures.append(("History", [(history(fit), "Errors after every iteration.")]))
     return pictures
 
 
@@ -130,13 +131,19 @@ def _table(heading: str, rows: Mapping[str, str]) -> str:
     return f"<h2>{html.escape(heading)}</h2>\n<table>\n{chr(10).join(cells)}\n</table>"
 
 
-def _figure(heading: str, figure: Any, caption: str) -> str:
+def _figures(heading: str, figures: list[tuple[Any, str]]) -> str:
+    """Figures under one heading, beside one another where there is room."""
+    name = html.escape(heading)
+    parts = "\n".join(_figure(name, *figure) for figure in figures)
+    return f'<h2>{name}</h2>\n<div class="row">\n{parts}\n</div>'
+
+
+def _figure(name: str, figure: Any, caption: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI)
     data = base64.b64encode(buffer.getvalue()).decode()
-    name = html.escape(heading)
     return (
-        f'<h2>{name}</h2>\n<figure><img alt="{name}" src="data:image/png;base64,{data}">'
+        f'<figure><img alt="{name}" src="data:image/png;base64,{data}">'
         f"<figcaption>{html.escape(caption)}</figcaption></figure>"
     )
 
