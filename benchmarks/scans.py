@@ -3,8 +3,8 @@
     python -m benchmarks scans [--part sheets held_out outliers cup] [name ...]
 
 `sheets`: what was left out, loops, share of the sheet's points inside them, the trimmed area over that of the
-mesh and over that of the mesh laid on the surface, errors in % of the diagonal inside the loops and of all
-points, folds inside the loops, seconds of processor time with compiling.
+mesh, errors in % of the diagonal inside the loops and of all points, folds inside the loops, seconds of
+processor time with compiling.
 `held_out`: one point in ten is held out, in three splits; its average error over that of the fitted points,
 and where the boundary is known over that of the fit that was given it, on the same net.
 `outliers`: one point in a hundred of the Igea face is moved by 3 % of the diagonal along its normal, either
@@ -45,7 +45,7 @@ def percent(errors):
 
 def sheets(names):
     """Everything that is said of a sheet and its loops."""
-    heads = "read dupl. outliers off loops inside area/mesh area/laid in:avg max all:avg max folds net cpu/s"
+    heads = "read dupl. outliers off loops inside area/mesh in:avg max all:avg max folds net cpu/s"
     row("", heads.split())
     for name in names or RAW + BOUNDED:
         points = arrays_of(name)["points"]
@@ -56,9 +56,9 @@ def sheets(names):
         area, errors = float(fit.trimmed.area()), np.asarray(fit.errors)
         counts = [stats[x] for x in ("points_read", "duplicates", "outliers", "off_the_sheet")]
         share = f"{inside[np.asarray(stats['counted'])].mean():.2%}"
-        ratios = [f"{area / stats[x]:.4f}" for x in ("sheet_area", "projected_area")]
+        ratio = f"{area / stats['sheet_area']:.4f}"
         figures = *percent(errors[inside]), *percent(errors), fit.folds, "{}x{}".format(*fit.surface.shape)
-        row(name, [*counts, len(fit.trimmed.loops), share, *ratios, *figures, f"{spent:.0f}"])
+        row(name, [*counts, len(fit.trimmed.loops), share, ratio, *figures, f"{spent:.0f}"])
 
 
 def held_out(names):

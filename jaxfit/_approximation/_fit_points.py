@@ -82,9 +82,9 @@ def fit_points(
     Fit
         Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
         `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
-        `feet_on_border`: points on the sheet whose foot is on the border of the domain; `sheet_area`, that of
-        the mesh; and `projected_area`, that of the mesh with its vertices moved to their feet. Noise makes
-        the mesh rough and the first of these areas too large; `trimmed.area()` is near the second.
+        `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
+        that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their normals to the
+        mean with their neighbours first, for noise makes a mesh rough and its area too large.
         `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left out have errors
         as well, but do not count; where they are not finite u, v and errors are NaN.
 

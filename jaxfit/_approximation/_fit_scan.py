@@ -15,7 +15,7 @@ from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
-from jaxfit._scan import Layout, Sheet, node_feet, projected_area, sheet_of, trim_loops
+from jaxfit._scan import Layout, Sheet, node_feet, sheet_of, trim_loops
 from jaxfit._trimmed import TrimmedSurface
 
 Order = tuple[int, int]
@@ -75,7 +75,6 @@ def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
         "holes": len(loops) - 1,
         "hole_length": sheet.hole_length,
         "sheet_area": sheet.area,
-        "projected_area": projected_area(fit.surface, sheet, nodes),
         "feet_on_border": int((on_border & sheet.on_sheet).sum()),
     }
     return dataclasses.replace(fit, stats=fit.stats | found, trimmed=TrimmedSurface(fit.surface, loops))

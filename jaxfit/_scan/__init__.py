@@ -4,5 +4,4 @@ from jaxfit._scan._sheet import Layout as Layout
 from jaxfit._scan._sheet import Sheet as Sheet
 from jaxfit._scan._sheet import sheet_of as sheet_of
 from jaxfit._scan._trim_loops import node_feet as node_feet
-from jaxfit._scan._trim_loops import projected_area as projected_area
 from jaxfit._scan._trim_loops import trim_loops as trim_loops

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._scan._manifold import Faces
-from jaxfit._scan._node_gradients import node_normals
+from jaxfit._scan._node_normals import node_normals
 
 BINS = 64  # along each side
 SMOOTHED = 1.5  # bins: standard deviation of the mean that is taken over neighbours

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit._scan._manifold import Faces
+from jaxfit._scan._node_normals import node_normals
 
 CANDIDATES = 8  # nodes next to a point
 ACROSS = 4.0  # by how much a step across the sheet counts more
@@ -39,15 +40,6 @@ def carried_places(
     length = np.linalg.norm(step, axis=1, keepdims=True)
     step = step * np.minimum(1.0, REACH * edge / np.maximum(length, np.finfo(float).tiny))
     return flat[nearest] + np.where(away[:, None] > 0, step, 0.0), away
-
-
-def node_normals(nodes: np.ndarray, faces: Faces) -> Float[np.ndarray, "_ 3"]:
-    """Unit normals of the nodes, the means over their triangles."""
-    a, b, c = (nodes[faces[:, k]] for k in range(3))
-    total = np.zeros_like(nodes)
-    for k in range(3):
-        np.add.at(total, faces[:, k], np.cross(b - a, c - a))
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(float).tiny)
 
 
 def _gradients(nodes: np.ndarray, faces: Faces, flat: np.ndarray) -> Float[np.ndarray, "nodes 2 3"]:

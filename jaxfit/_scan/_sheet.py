@@ -10,7 +10,7 @@ from jaxfit._scan._cleaning import Cleaned, cleaned
 from jaxfit._scan._extras import import_shapely
 from jaxfit._scan._flat_places import Rectangle, rectangle_around
 from jaxfit._scan._knot_density import break_points, knot_densities
-from jaxfit._scan._manifold import Faces, areas, manifold
+from jaxfit._scan._manifold import Faces, manifold
 from jaxfit._scan._sheet_mesh import COVERED, MOST_NODES, sheet_mesh
 
 LEAST_POINTS = 12
@@ -35,6 +35,7 @@ class Sheet(NamedTuple):
     spacing: float  # between nodes around it
     outset: float  # how far points may lie outside the loops of nodes
     hole_length: float  # in the unit of the points handed in
+    area: float  # of the mesh, in the squared unit of the points handed in
     counts: dict[str, int]
 
     def layout(self, net: tuple[int, int], order: tuple[int, int]) -> "Layout":
@@ -47,11 +48,6 @@ class Sheet(NamedTuple):
         u, v = ((x - x[0]) / (x[-1] - x[0]) for x in breaks)
         knots = np.pad(u, order[0] - 1, mode="edge"), np.pad(v, order[1] - 1, mode="edge")
         return Layout((self.places - low) / whole, whole, knots)
-
-    @property
-    def area(self) -> float:
-        """Of the mesh, in the squared unit of the points handed in."""
-        return float(areas(self.nodes, self.faces).sum()) * self.size**2
 
 
 class Layout(NamedTuple):
@@ -112,6 +108,7 @@ def sheet_of(
         spacing=spacing,
         outset=outset,
         hole_length=length * size,
+        area=mesh.area * size**2,
         counts=counts,
     )
 

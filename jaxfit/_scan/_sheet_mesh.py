@@ -9,13 +9,15 @@ from jaxfit._scan._coarse_mesh import coarse_faces
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
-from jaxfit._scan._manifold import Faces, in_use, longest_edges, pieces
+from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces
 from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
 from jaxfit._scan._node_gradients import carried_places
+from jaxfit._scan._node_normals import area_without_noise
 from jaxfit._scan._topology import largest_piece, sheet_loops
 
 MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
+LEVEL_NODES = 14_000  # of a mesh over a plane: hardly more than control points, or it is rougher than any fit
 HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
 FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
@@ -31,6 +33,7 @@ class SheetMesh(NamedTuple):
     flat: np.ndarray  # (nodes, 2)
     places: np.ndarray  # (points, 2)
     away: np.ndarray  # (points,) distance to the nearest node of the sheet
+    area: float
 
 
 def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple[SheetMesh, float]:
@@ -99,7 +102,8 @@ def _laid_out(
     doing(f"laying {len(faces):,} triangles out flat")
     flat = flat_places(nodes, faces, loops)
     places, away = carried_places(cloud, nodes, faces, flat, known)
-    return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away))
+    area = area_without_noise(nodes, faces)
+    return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away), area)
 
 
 def _separate(nodes: np.ndarray, faces: Faces, used: np.ndarray, gap: float) -> np.ndarray:
@@ -129,7 +133,7 @@ def _level(cloud: np.ndarray, length: float | None) -> tuple[SheetMesh, float]:
 
     frame = principal_frame(cloud)[0]
     turned = cloud @ frame.T
-    nodes = level_nodes(turned, MOST_NODES).nodes
+    nodes = level_nodes(turned, LEVEL_NODES).nodes
     flat = nodes * [1, 1, 0]
     reach = _hole_length(flat) if length is None else length
     faces = largest_piece(flat, level_mesh(nodes, reach))
@@ -137,7 +141,8 @@ def _level(cloud: np.ndarray, length: float | None) -> tuple[SheetMesh, float]:
     nodes, faces = nodes[used], (np.cumsum(used) - 1)[faces]
     away = cKDTree(nodes[:, :2]).query(turned[:, :2])[0]
     loops = sheet_loops(nodes * [1, 1, 0], faces)
-    return SheetMesh(nodes @ frame, faces, loops, nodes[:, :2], turned[:, :2], away), reach
+    area = float(areas(nodes, faces).sum())  # medians have little noise
+    return SheetMesh(nodes @ frame, faces, loops, nodes[:, :2], turned[:, :2], away, area), reach
 
 
 def _hole_length(nodes: np.ndarray) -> float:

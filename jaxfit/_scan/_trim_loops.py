@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxfit._closest import closest_point
 from jaxfit._scan._extras import import_shapely
-from jaxfit._scan._manifold import Faces, areas
+from jaxfit._scan._manifold import Faces
 from jaxfit._scan._sheet import Sheet
 from jaxfit._splines import BSplineSurface
 
@@ -51,16 +51,6 @@ def _union(places: Float[Any, "nodes 2"], faces: Faces) -> Any:
     triangles = shapely.polygons(corners)
     area = shapely.area(triangles)
     return _largest(shapely.union_all(triangles[area > LEAST_AREA * area.mean()]))
-
-
-def projected_area(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "nodes 2"]) -> float:
-    """Of the mesh, its nodes moved to their feet: without the roughness that noise gives the mesh."""
-    from scipy.interpolate import NdBSpline
-
-    arrays = surface.knots_u, surface.knots_v, surface.control_points
-    knots_u, knots_v, net = (np.asarray(x, float) for x in arrays)
-    spline = NdBSpline((knots_u, knots_v), net, tuple(order - 1 for order in surface.order))
-    return float(areas(spline(feet), sheet.faces).sum())
 
 
 def node_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> Loop:
