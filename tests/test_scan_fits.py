@@ -82,11 +82,27 @@ def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
 
 def test_noise_makes_no_sheet_larger(fit):
     points = scan()
-    points[:, 2] += np.random.default_rng(1).normal(0, 0.015, len(points))
+    points[:, 2] += np.random.default_rng(1).normal(0, 0.008, len(points))
     noisy = jf.fit_points(points, net=(7, 7), max_steps=3)
     area = float(noisy.trimmed.area())
     assert np.isclose(area, noisy.stats["sheet_area"], rtol=0.02)
     assert np.isclose(area, float(fit.trimmed.area()), rtol=0.03)
+
+
+@pytest.mark.parametrize("spacings", [0.35, 1.0])
+def test_noise_as_large_as_the_spacing_tears_no_sheet(spacings):
+    half, count = np.pi, 1600
+    angle, height = (np.arange(count)[:, None] / [1.3247179572, 1.3247179572**2] % 1).T * [[half], [2.0]]
+    points = np.stack([np.cos(angle), np.sin(angle), height], axis=1)
+    noise = spacings * np.sqrt(2.0 * half / count)
+    points += np.random.default_rng(0).normal(0, noise, points.shape)
+    fit = jf.fit_points(points, net=(8, 8), max_steps=10)
+    at = np.asarray(fit.surface(fit.u, fit.v))[np.asarray(fit.inside)]
+    assert fit.folds == 0
+    assert len(at) > 0.98 * count
+    assert np.abs(np.hypot(at[:, 0], at[:, 1]) - 1.0).mean() < 0.2 * noise
+    # Noise along the sheet moves its rim outwards.
+    assert 2.0 * half < float(fit.trimmed.area()) < (2.0 + 2 * noise) * (half + 2 * noise) * 1.05
 
 
 def test_results_are_in_the_frame_of_the_points(fit):

@@ -67,7 +67,7 @@ def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
     """With the rim and the holes in the parameters of its surface, and what was found on the way."""
     feet = np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1)[sheet.number]
     nodes = node_feet(fit.surface, sheet, feet)
-    loops = trim_loops(fit.surface, sheet, layout.sides, nodes)
+    loops = trim_loops(fit.surface, sheet, layout.sides, nodes, feet)
     domain = [tuple(float(x) for x in limits) for limits in fit.surface.domain]
     on_border = np.any([np.isin(x, limits) for x, limits in zip(feet.T, domain, strict=True)], axis=0)
     found = {

@@ -11,10 +11,9 @@ from jaxfit._scan._extras import import_shapely
 from jaxfit._scan._flat_places import Rectangle, rectangle_around
 from jaxfit._scan._knot_density import break_points, knot_densities
 from jaxfit._scan._manifold import Faces, manifold
-from jaxfit._scan._sheet_mesh import COVERED, MOST_NODES, sheet_mesh
+from jaxfit._scan._sheet_mesh import COVERED, sheet_mesh
 
 LEAST_POINTS = 12
-OUTSET = 0.5  # of the spacing: how far beyond nodes that stand for several points the rim is
 
 
 class Sheet(NamedTuple):
@@ -33,7 +32,6 @@ class Sheet(NamedTuple):
     centre: Float[np.ndarray, "3"]
     size: float
     spacing: float  # between nodes around it
-    outset: float  # how far points may lie outside the loops of nodes
     hole_length: float  # in the unit of the points handed in
     area: float  # of the mesh, in the squared unit of the points handed in
     counts: dict[str, int]
@@ -91,7 +89,6 @@ def sheet_of(
     densities = knot_densities(mesh.nodes, mesh.faces, flat, rectangle.sides)
     nearest = _nearest((points[np.isfinite(points).all(axis=1)] - centre) / size, cloud)
     spacing = float(np.median(np.concatenate([_steps(mesh.nodes[x]) for x in mesh.loops])))
-    outset = 0.0 if len(mesh.nodes) <= len(cloud) < MOST_NODES else OUTSET * spacing
     return Sheet(
         points=cloud,
         number=clean.kept,
@@ -106,7 +103,6 @@ def sheet_of(
         centre=centre,
         size=size,
         spacing=spacing,
-        outset=outset,
         hole_length=length * size,
         area=mesh.area * size**2,
         counts=counts,

@@ -6,6 +6,8 @@ import numpy as np
 
 from jaxfit._progress_line import doing
 from jaxfit._scan._coarse_mesh import coarse_faces
+from jaxfit._scan._denoised_nodes import ROUNDS, denoised_nodes, is_noisy
+from jaxfit._scan._even_choice import even_choice
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
@@ -13,11 +15,11 @@ from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces
 from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
 from jaxfit._scan._node_gradients import carried_places
 from jaxfit._scan._node_normals import area_without_noise
-from jaxfit._scan._topology import largest_piece, sheet_loops
+from jaxfit._scan._topology import RoughError, largest_piece, sheet_loops
 
 MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
-LEVEL_NODES = 14_000  # of a mesh over a plane: hardly more than control points, or it is rougher than any fit
+LEVEL_NODES = 12_000  # of a mesh over a plane: hardly more than control points, or it is rougher than any fit
 HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
 FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
@@ -38,25 +40,46 @@ class SheetMesh(NamedTuple):
 
 def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> tuple[SheetMesh, float]:
     """The mesh of the cloud, and the length that decided what is a hole."""
-    chosen = np.arange(len(cloud)) if len(cloud) <= MOST_NODES else _even_choice(cloud)
+    chosen = np.arange(len(cloud)) if len(cloud) <= MOST_NODES else even_choice(cloud, MOST_NODES)
     nodes = cloud[chosen]
     if faces is not None:
         return _from_faces(cloud, nodes, faces, chosen, length)
-    reach = _hole_length(nodes) if length is None else length
-    found = neighbourhood_mesh(nodes, reach)
-    if (covered := _coverage(nodes, found)) < COVERED:
+    try:
+        return _by_neighbours(cloud, nodes, length)
+    except RoughError as error:
         if is_level(cloud):
             return _level(cloud, length)
+        return _without_noise(cloud, nodes, length, error)
+
+
+def _by_neighbours(
+    cloud: np.ndarray, nodes: np.ndarray, length: float | None, noise: bool = True
+) -> tuple[SheetMesh, float]:
+    """The mesh of nodes that neighbours agree on."""
+    reach = _hole_length(nodes) if length is None else length
+    found = neighbourhood_mesh(nodes, reach)
+    if _coverage(nodes, found) < COVERED:
         found = neighbourhood_mesh(nodes, reach, least_votes=1)
-        covered = _coverage(nodes, found)
-    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
-    if covered < COVERED:
-        raise ValueError(
+    if (covered := _coverage(nodes, found)) < COVERED:
+        raise RoughError(
             f"points must lie on one sheet, but neighbours agree on a surface for only "
             f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
             "hole_length where they are sparse."
         )
-    return _laid_out(cloud, nodes, whole, found, reach), reach
+    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
+    return _laid_out(cloud, nodes, whole, found, reach, noise=noise), reach
+
+
+def _without_noise(
+    cloud: np.ndarray, nodes: np.ndarray, length: float | None, error: RoughError
+) -> tuple[SheetMesh, float]:
+    """The mesh of fewer nodes, each where many points say; raises `error` where it was not noise."""
+    for fewer in range(1, ROUNDS + 1 if is_noisy(nodes) else 1):
+        try:
+            return _by_neighbours(cloud, denoised_nodes(nodes, fewer), length, noise=False)
+        except RoughError:
+            continue
+    raise error
 
 
 def _from_faces(
@@ -87,6 +110,7 @@ def _laid_out(
     before: Faces,
     length: float,
     region: np.ndarray | None = None,
+    noise: bool = True,
 ) -> SheetMesh:
     """The largest piece of a mesh of nodes in space; all points get places from the nearest node, or from the
     node of their `region`.
@@ -102,7 +126,7 @@ def _laid_out(
     doing(f"laying {len(faces):,} triangles out flat")
     flat = flat_places(nodes, faces, loops)
     places, away = carried_places(cloud, nodes, faces, flat, known)
-    area = area_without_noise(nodes, faces)
+    area = area_without_noise(nodes, faces) if noise else float(areas(nodes, faces).sum())
     return SheetMesh(nodes, faces, loops, flat, places, np.where(stray, np.inf, away), area)
 
 
@@ -151,14 +175,3 @@ def _hole_length(nodes: np.ndarray) -> float:
     count = min(7, len(nodes))
     sixth = cKDTree(nodes).query(nodes, count)[0][:, -1]
     return HOLE_SPACINGS * float(np.percentile(sixth, COMMON_SPACING))
-
-
-def _even_choice(cloud: np.ndarray) -> np.ndarray:
-    """Numbers of about `MOST_NODES` points, one from each cube that has any."""
-    size = 1.0 / np.sqrt(MOST_NODES)
-    while True:
-        cell = np.floor(cloud / size).astype(int)
-        _, first = np.unique(cell, axis=0, return_index=True)
-        if len(first) <= MOST_NODES:
-            return np.sort(first)
-        size *= max(np.sqrt(len(first) / MOST_NODES), 1.02)

@@ -23,6 +23,10 @@ TUBE_AREA = 2.0  # least area of a tube, times the difference of these
 REMEDY = "cut the points and fit the parts"
 
 
+class RoughError(ValueError):
+    """A mesh that noise may have torn or tied together."""
+
+
 def largest_piece(points: Float[Any, "points 3"], faces: Faces) -> Faces:
     """The triangles of the largest piece; raises ValueError if there is another of comparable size."""
     if not len(faces):
@@ -56,7 +60,7 @@ def sheet_loops(points: Float[Any, "points 3"], faces: Faces) -> list[Int[np.nda
     euler = vertices - len(np.unique(edges, axis=0)) + len(faces)
     handles = (2 - len(loops) - euler) // 2
     if handles > 0:
-        raise ValueError(
+        raise RoughError(
             f"points must make a disc with or without holes, but their surface has {handles} "
             f"handle{'s' * (handles != 1)} (Euler characteristic {euler}, {len(loops)} boundary loops); "
             f"{REMEDY}, or lower hole_length so that no bridge is made across a gap."

@@ -15,26 +15,32 @@ SMOOTHED = 0.5  # of the spacing: notches of the rim this narrow are closed
 STRAIGHT = 0.02  # of the spacing: vertices this near to the line between others are dropped
 LEAST_HOLE = 0.25  # times the squared hole length: smaller ones are gaps between triangles
 LEAST_AREA = 1e-9  # of the mean: smaller triangles cover nothing
+MOST_SINGLE = 0.75  # nodes for each point, above which the rim goes through points
 LONGEST = 2.0  # times the spacing: longer edges are divided
 
 Loop = Float[np.ndarray, "vertices 2"]
 
 
 def trim_loops(
-    surface: BSplineSurface, sheet: Sheet, sides: Float[Any, "2"], feet: Float[Any, "nodes 2"]
+    surface: BSplineSurface,
+    sheet: Sheet,
+    sides: Float[Any, "2"],
+    nodes: Float[Any, "nodes 2"],
+    points: Float[Any, "kept 2"],
 ) -> tuple[Loop, ...]:
     """Closed polylines in (u, v), the rim first and counter-clockwise, holes clockwise.
 
     They bound the union of the mesh's triangles, their vertices at their feet: whatever noise does to single
     triangles, that is a region, and it holds the feet of all vertices. Its narrow notches and small gaps are
-    closed.
+    closed. `nodes` and `points` are the feet of these.
     """
     shapely = import_shapely()
     low, high = np.asarray(surface.domain, float).T
     scale = sides / (high - low)  # (u, v) to about the lengths of the sheet
-    region = _union((feet - low) * scale, sheet.faces)
+    region = _union((nodes - low) * scale, sheet.faces)
+    outset = _outset(region, ((points - low) * scale)[sheet.on_sheet], len(nodes))
     reach, least = SMOOTHED * sheet.spacing, STRAIGHT * sheet.spacing
-    region = _largest(region.buffer(reach).buffer(-reach).simplify(least).buffer(least + sheet.outset))
+    region = _largest(region.buffer(reach).buffer(-reach).simplify(least).buffer(least + outset))
     region = _largest(region.intersection(shapely.box(0.0, 0.0, *sides)))
     smallest = LEAST_HOLE * (sheet.hole_length / sheet.size) ** 2
     holes = [x for x in region.interiors if shapely.Polygon(x).area > smallest]
@@ -51,6 +57,19 @@ def _union(places: Float[Any, "nodes 2"], faces: Faces) -> Any:
     triangles = shapely.polygons(corners)
     area = shapely.area(triangles)
     return _largest(shapely.union_all(triangles[area > LEAST_AREA * area.mean()]))
+
+
+def _outset(region: Any, points: Float[Any, "some 2"], nodes: int) -> float:
+    """How far the points reach beyond nodes that stand for several of them.
+
+    They lie evenly in a strip around the nodes: half of them in its inner half.
+    """
+    shapely = import_shapely()
+    shapely.prepare(region)
+    outside = points[~shapely.contains_xy(region, *points.T)]
+    if nodes > MOST_SINGLE * len(points) or not len(outside):
+        return 0.0
+    return 2.0 * float(np.median(shapely.distance(region, shapely.points(outside))))
 
 
 def node_feet(surface: BSplineSurface, sheet: Sheet, feet: Float[Any, "kept 2"]) -> Loop:
