@@ -64,10 +64,11 @@ class AbstractIterativeMethod(eqx.Module):
     diagonal of the data is about 1, and errors in the history are fractions of that diagonal. Points are
     padded, and those of weight 0 must not influence the surface.
 
-    The state is any pytree of arrays whose structure, shapes and dtypes do not change; the loop does not use
-    it. What a method remembers from one function to the next has to be in it. Outside transformations `init`
-    is called with NumPy arrays; the other functions are always traced, so they use `jnp.where` and `lax.cond`
-    instead of `if`.
+    The state is any pytree of arrays whose structure, shapes and dtypes do not change. What a method
+    remembers from one function to the next has to be in it. The loop uses none of it but an attribute `sums`,
+    if there is one: after `measure` it adds these up over the devices among which the points are divided.
+    Outside transformations `init` is called with NumPy arrays; the other functions are always traced, so they
+    use `jnp.where` and `lax.cond` instead of `if`.
 
     A method is an `equinox.Module`, and its fields are its options. Fields that are Python floats are traced,
     so that another value compiles nothing; all other fields are static and must be hashable. The two
