@@ -16,7 +16,7 @@ from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_page import write_page
 from jaxfit._cli_report import print_table, progress_bar
-from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line
+from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
 from jaxfit._fit._summary import facts
 
 REACHED, NOT_REACHED, BAD_INPUT, FAILED = 0, 1, 2, 3
@@ -70,6 +70,7 @@ def _fail(sentence: object, code: int) -> int:
 
 def _fit_command(args: argparse.Namespace, started: float) -> int:
     choose_precision(args)
+    trace_quickly()
     picture = _check_files(args)
     set_compile_cache(args)
     data = read(args)

@@ -1,6 +1,7 @@
 """What the command asks of JAX: its precision, and that it keeps the programs it compiles."""
 
 import argparse
+import gc
 import os
 import sys
 
@@ -13,6 +14,13 @@ from jaxfit._progress_line import SETTING
 def choose_precision(args: argparse.Namespace) -> None:
     """Double, unless told ``--float32``."""
     jax.config.update("jax_enable_x64", not args.float32)
+
+
+def trace_quickly() -> None:
+    """Less work around tracing: its many small objects are no rubbish, and no line of source is kept."""
+    gc.freeze()  # what is imported stays
+    gc.set_threshold(50_000, 20, 50)
+    jax.config.update("jax_traceback_in_locations_limit", 0)
 
 
 def show_no_line() -> None:
