@@ -101,7 +101,7 @@ def fit_points(
 
     Notes
     -----
-    Without a `net` a coarse one is fitted to nine in ten of the points and then made up to 1.5 times finer
+    Without a `net` a coarse one is fitted to nine in ten of the points and then made up to 1.44 times finer
     each way, again and again, each fit starting from the one before. That ends where the tolerances are met.
     It also ends where the tenth of the points that was held out comes no nearer to the surface, by 2 % of its
     average error, as the net gets finer: what is left is noise, and the net before is taken. And it ends

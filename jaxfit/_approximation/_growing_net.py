@@ -15,7 +15,9 @@ from jaxfit._splines import BSplineSurface
 
 FIRST_SIZE = 8.0  # control points along each direction of a square patch
 MOST_SIZE = 200  # control points along either direction
-GROWTH, LEAST_GROWTH = 1.5, 1.2  # of the size from one net to the next; the least where the tolerance is near
+# From one net to the next the size grows by a factor or, far from the tolerance, by its square: sizes are
+# those of one ladder, so that clouds that differ little get the same net.
+GROWTH, MOST_FACTORS = 1.2, 2
 BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
 LEVEL_STEPS = 20  # iterations with each net but the last
 LEAST_POINTS = 500  # of a cloud from which some can be held out
@@ -114,7 +116,8 @@ class NetGrowth:
             for error, goal in zip((fit.average_error, fit.maximum_error), goals, strict=True)
             if goal is not None
         )
-        return float(np.clip(np.sqrt(excess), LEAST_GROWTH, GROWTH))
+        factors = np.round(np.log(np.sqrt(excess)) / np.log(GROWTH))
+        return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
 
 
 def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
@@ -126,7 +129,7 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     request["start"] = growth.nets.feet(growth.net(size))
     fit = growth.fit(growth.points, level.fit.surface, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
-        size *= LEAST_GROWTH
+        size *= GROWTH
         if bool(fit.converged) or size > growth.most:
             break
         net = growth.net(size)
