@@ -31,6 +31,21 @@ def base():
     return jf.base_surface(jf.Boundary(**grid_edges(grid)), net=(14, 14))
 
 
+def test_points_beyond_a_held_border_are_told_and_met_with_a_free_one():
+    points, edges = wavy_cloud(200)
+    middle = points.mean(axis=0)
+    base = jf.base_surface(
+        jf.Boundary(**{k: middle + 0.8 * (x - middle) for k, x in edges.items()}), net=(7, 6)
+    )
+    held, free = (
+        jf.approximate(points, base, jf.OrthogonalDistance(border=border), tol_average=1e-3, max_steps=30)
+        for border in (jf.FixedBorder(), jf.FreeBorder())
+    )
+    assert "border=FreeBorder()" in held.message
+    assert "FreeBorder" not in free.message
+    assert free.average_error < 0.1 * held.average_error
+
+
 def test_a_pocket_under_the_sheet_makes_no_fold_and_is_out_of_reach(base):
     points, bowl = pocketed()
     fit = jf.approximate(points, base, tol_average=1e-6, max_steps=60)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from jaxfit._fit._result import Fit
 
 
+FAR, MUCH = 4.0, 0.05  # times the average error; of the sum of errors
 _REMEDIES = {
     True: "look at the order of the grid's points there (fit.regularity.fold_parameters)",
     False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
@@ -113,9 +114,27 @@ def _largest_group(found: Regularity) -> str:
     return "{} round u = {:.3g}, v = {:.3g}".format(groups, *middle)
 
 
+def _share_at_border(fit: Any) -> float:
+    """What points far from the surface whose feet are on its border add to the sum of all errors."""
+    errors = np.asarray(fit.errors)
+    at_ends = [
+        np.isin(np.asarray(x), np.asarray(limits))
+        for x, limits in zip((fit.u, fit.v), fit.surface.domain, strict=True)
+    ]
+    beyond = (at_ends[0] | at_ends[1]) & (errors > FAR * float(fit.average_error))
+    return float(errors[beyond].sum() / max(errors.sum(), np.finfo(float).tiny))
+
+
 def with_folds(fit: Any, sentence: str) -> str:
     """The reason for which a fit stopped, and that its surface folds if it does, or was kept from folding."""
-    if is_single(fit) and fit.stats.get("points_out_of_reach", 0) > 0 and not bool(fit.converged):
+    missed = is_single(fit) and not bool(fit.converged)
+    of_cloud = "method" in fit.stats and fit.trimmed is None
+    if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
+        sentence = (
+            f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "
+            "this is not where they end; if the method holds it, free it by border=FreeBorder()."
+        )
+    if missed and fit.stats.get("points_out_of_reach", 0) > 0:
         sentence = (
             f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
             "this net that does not fold; insert knots, or look whether they lie on another sheet."
