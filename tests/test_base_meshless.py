@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import jaxfit as jf
+from jaxfit._base import _delaunay_stars
 from jaxfit._base._delaunay_stars import mean_value_weights, stars
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -51,6 +52,23 @@ def test_stars_are_those_of_the_delaunay_triangulation():
     weights = mean_value_weights(star)
     means = np.sum(weights[..., None] * points[star.members], axis=1) / weights.sum(axis=1)[:, None]
     np.testing.assert_allclose(means[inner], points[inner], atol=1e-12)
+
+
+def test_gaps_between_scan_lines_take_no_search_among_all_points(monkeypatch):
+    x, y = np.meshgrid(np.linspace(0, 1, 400), np.linspace(0, 1, 20), indexing="ij")
+    points = np.stack([x, y], axis=2).reshape(-1, 2)
+    points = points + np.random.default_rng(0).normal(0, [1e-4, 2e-3], points.shape)
+    entries, search = [], _delaunay_stars._stars_among
+
+    def counted(planes, rows, members, filled):
+        entries.append(members.size)
+        return search(planes, rows, members, filled)
+
+    monkeypatch.setattr(_delaunay_stars, "_stars_among", counted)
+    star = stars(points, 16)
+    assert sum(entries) < 200 * len(points)
+    inner = np.all(np.abs(points - 0.5) < 0.42, axis=1)
+    assert (star.angle[inner].max(axis=1) < np.pi).mean() > 0.99
 
 
 def test_a_flat_square_keeps_its_coordinates_at_eight_to_one_density():

@@ -20,7 +20,9 @@ COCIRCULAR = 1e-7  # sine of an angle of the hull that still counts as straight
 SLOPE_POWER = 3  # powers of the cosine that a step out of the plane is lengthened by
 LEAST_COSINE = 0.05  # the least such cosine
 WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than this
-MOST_ACROSS = 1000  # points with a wide gap that may be neighbours across it
+# Points with a wide gap that may be neighbours across it: few, and then many where more than half a turn is
+# still free. Less than that has a triangle, if a thin one, as on scan lines.
+ACROSS = (100, WIDEST), (1000, np.pi)
 ENTRIES = 1 << 20  # of arrays at once, in the search for these
 
 
@@ -45,19 +47,22 @@ def stars(points: Float[Any, "points d"], count: int, fixed: int = 0, planes: Pl
     """The stars among about `count` neighbours, d >= 2, in given planes or in those of as many neighbours; no
     two points may coincide.
 
-    Points with a wide gap, except the first `fixed` ones, get a second search among all points that have one:
-    the points on the rim of a hole are then neighbours across it. Otherwise the hole would grow.
+    Points with a wide gap, except the first `fixed` ones, get a second search among all points that have one,
+    and a third one if the gap stays: the points on the rim of a hole are then neighbours across it. Otherwise
+    the hole would grow.
     """
     members, filled = neighbourhoods(points, count)
     planes = _planes(points, members, filled) if planes is None else planes
     star = _stars_among(planes, np.arange(len(points)), members, filled)
     gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
-    rows = gaping[gaping >= fixed]
-    at_once = max(ENTRIES // min(len(gaping) + 1, MOST_ACROSS), 1)
-    for k in range(0, len(rows), at_once):
-        part = rows[k : k + at_once]
-        members, filled = _with_nearest(star, points, part, gaping)
-        star = _replaced(star, part, _stars_among(planes, part, members, filled))
+    for across, widest in ACROSS:
+        rows = gaping[(gaping >= fixed) & (star.angle[gaping] > widest).any(axis=1)]
+        most = min(len(gaping), across)
+        at_once = max(ENTRIES // (most + 1), 1)
+        for k in range(0, len(rows), at_once):
+            part = rows[k : k + at_once]
+            members, filled = _with_nearest(star, points, part, gaping, most)
+            star = _replaced(star, part, _stars_among(planes, part, members, filled))
     return star
 
 
@@ -72,12 +77,12 @@ def _stars_among(planes: Planes, rows: np.ndarray, members: np.ndarray, filled: 
 
 
 def _with_nearest(
-    star: Stars, points: np.ndarray, rows: np.ndarray, others: np.ndarray
+    star: Stars, points: np.ndarray, rows: np.ndarray, others: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The members of these stars, and the nearest of the `others` that are not among them."""
+    """The members of these stars, and what is not among them of the `count` nearest of the `others`."""
     from scipy.spatial import cKDTree
 
-    near = cKDTree(points[others]).query(points[rows], min(len(others), MOST_ACROSS))[1]
+    near = cKDTree(points[others]).query(points[rows], count)[1]
     near = others[near.reshape(len(rows), -1)]
     members, filled = star.members[rows], star.filled[rows]
     known = near == rows[:, None]
