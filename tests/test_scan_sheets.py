@@ -120,6 +120,18 @@ def test_what_is_no_sheet_is_said(points, sentence):
         sheet_of(points)
 
 
+@pytest.mark.parametrize("lines", [14, 34])
+def test_scan_lines_with_few_points_across_make_one_sheet(lines):
+    """Half a cylinder, 10 to 60 times as dense along lines as across them."""
+    x, y = np.meshgrid(np.linspace(0, 1, 12_000 // lines), np.linspace(0, 1, lines), indexing="ij")
+    y = y + 0.05 / lines * np.random.default_rng(0).normal(size=y.shape)
+    sheet = sheet_of(np.stack([np.cos(np.pi * x), np.sin(np.pi * x), np.pi * y], axis=2).reshape(-1, 3))
+    assert len(sheet.loops) == 1
+    assert sheet.on_sheet.all()
+    assert np.isclose(sheet.area, np.pi**2, rtol=0.1)
+    assert np.allclose(np.ptp(sheet.places, axis=0), sheet.sides, rtol=1e-9)
+
+
 def test_a_band_with_a_twist_of_triangles_is_no_manifold():
     faces = np.array([[0, 1, 2], [0, 1, 3], [2, 1, 4]])
     kept = manifold(faces)

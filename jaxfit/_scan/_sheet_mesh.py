@@ -15,6 +15,7 @@ from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces
 from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
 from jaxfit._scan._node_gradients import carried_places
 from jaxfit._scan._node_normals import area_without_noise
+from jaxfit._scan._scan_lines import thinned_along_lines
 from jaxfit._scan._topology import RoughError, largest_piece, sheet_loops
 
 MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
@@ -44,6 +45,7 @@ def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> 
     nodes = cloud[chosen]
     if faces is not None:
         return _from_faces(cloud, nodes, faces, chosen, length)
+    nodes = thinned_along_lines(nodes)
     try:
         return _by_neighbours(cloud, nodes, length)
     except RoughError as error:

@@ -1,0 +1,45 @@
+"""Nodes for clouds far denser along their scan lines than across: the nearest points are all on one line.
+
+A plane through them may turn round that line, so that no mesh of all points joins one line with the next.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit._scan._even_choice import even_choice
+
+NEIGHBOURS = 16, 64, 256  # of a point: more of them are on a line that is itself several points wide
+NARROW = 0.35  # where their spread across it is so small a part of that along it,
+NARROW_SHARE = 0.2  # and the cloud is on lines where as many of its points are
+ENOUGH = 2000  # points to tell
+LEAST_NODES = 100
+
+
+def thinned_along_lines(points: Float[Any, "points 3"]) -> Float[Any, "nodes 3"]:
+    """Of points on lines so few, evenly chosen, that neighbours are on several lines; of others all."""
+    nodes = points
+    while on_lines(nodes):
+        nodes = nodes[even_choice(nodes, len(nodes) // 2)]
+        if len(nodes) < LEAST_NODES:
+            return points
+    return nodes
+
+
+def on_lines(points: Float[Any, "points 3"]) -> bool:
+    """Whether the neighbours of many points lie along a line."""
+    from scipy.spatial import cKDTree
+
+    tree, some = cKDTree(points), points[:: -(-len(points) // ENOUGH)]
+    return any(
+        _narrow_share(points[tree.query(some, count + 1)[1]]) > NARROW_SHARE
+        for count in NEIGHBOURS
+        if count < len(points) / 8
+    )
+
+
+def _narrow_share(near: Float[Any, "some near 3"]) -> float:
+    steps = near - near.mean(axis=1, keepdims=True)
+    squares = np.linalg.eigvalsh(np.swapaxes(steps, 1, 2) @ steps)
+    return float((squares[:, 1] < NARROW**2 * squares[:, 2]).mean())
