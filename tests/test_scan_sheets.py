@@ -5,6 +5,7 @@ import pytest
 from helpers import data
 
 from jaxfit._scan import _sheet_mesh, sheet_of
+from jaxfit._scan._cleaning import cleaned
 from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
 
 pytest.importorskip("shapely")
@@ -67,6 +68,14 @@ def test_what_is_left_out_is_counted():
     assert sheet.counts["non_finite"] == 3
     assert sheet.counts["outliers"] + sheet.counts["off_the_sheet"] == 7 + 4
     assert set(sheet.number[sheet.on_sheet]) == set(range(400))
+
+
+def test_no_point_is_an_outlier_where_a_sheet_turns_sparse():
+    """Half a cylinder of 20,000 points, a tenth of it a hundred times as dense."""
+    x, y = np.random.default_rng(4).random((2, 20_000))
+    x[:18_000] *= 0.1
+    points = np.stack([np.cos(np.pi * x), np.sin(np.pi * x), y], axis=1)
+    assert cleaned(points).outliers == 0
 
 
 def test_a_hole_wider_than_the_length_is_a_hole():

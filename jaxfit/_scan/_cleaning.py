@@ -7,7 +7,10 @@ from jaxtyping import Bool, Float, Int
 
 NEIGHBOURS = 16
 PLANES = 4  # times the plane through the neighbours is laid; each time, those far from it count less
-FAR = 4.0  # times the usual distance of neighbours: a point with nobody near
+FAR = 4.0  # times the usual distance of neighbours: a point with nobody near,
+ALOFT = 0.2  # if it is off their plane by so much of its own distance from them,
+SPARSE = 2.0  # or that is so many times what
+COMMON = 0.95  # of all points have at most: the cloud is nowhere so sparse
 OFF_USUAL = 8.0  # times the median height of the neighbours over their own planes,
 OFF_MOST = 4.0  # times what four in five of them stay below,
 OFF_SPACING = 0.4  # times the distance of neighbours: all three for a point off the plane of its neighbours
@@ -29,7 +32,7 @@ def cleaned(points: Float[Any, "points 3"]) -> Cleaned:
 
     An outlier has no neighbours within several times the usual distance, or lies off the plane of its
     neighbours: by much more than they lie off theirs. An edge is no outlier, for there neighbours lie off
-    their planes as well.
+    their planes as well; nor is a point on the plane of denser ones, where a sheet turns sparse.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     _, first = np.unique(points[finite], axis=0, return_index=True)
@@ -57,7 +60,8 @@ def _outliers(points: np.ndarray) -> Bool[np.ndarray, " points"]:
     )
     least = ROUNDING * np.linalg.norm(np.ptp(middle, axis=0))
     off = (height > OFF_USUAL * usual) & (height > OFF_MOST * most) & (height > OFF_SPACING * spacing + least)
-    return off | (reach > FAR * spacing + least)
+    far = reach > FAR * spacing + least
+    return off | far & ((height > ALOFT * reach) | (reach > SPARSE * np.quantile(reach, COMMON)))
 
 
 def _heights(points: Float[Any, "points 3"], near: Float[Any, "points near 3"]) -> Float[Any, " points"]:
