@@ -121,8 +121,9 @@ def test_units_offsets_and_order_do_not_matter():
         (np.concatenate([square(), square() + np.array([3.0, 0, 0])]), "several pieces"),
         (open_torus(), "1 handle "),
         (square(3), "at least 12"),
+        (square() * [1, 1e-9, 0] + [5e5, 5e6, 0], "lie on a line"),
     ],
-    ids=["tube", "sphere", "two pieces", "handle", "few"],
+    ids=["tube", "sphere", "two pieces", "handle", "few", "line"],
 )
 def test_what_is_no_sheet_is_said(points, sentence):
     with pytest.raises(ValueError, match=sentence):

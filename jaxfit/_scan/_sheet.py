@@ -10,10 +10,12 @@ from jaxfit._scan._cleaning import Cleaned, cleaned
 from jaxfit._scan._extras import import_shapely
 from jaxfit._scan._flat_places import Rectangle, rectangle_around
 from jaxfit._scan._knot_density import break_points, knot_densities
+from jaxfit._scan._level_sheet import principal_frame
 from jaxfit._scan._manifold import Faces, manifold
 from jaxfit._scan._sheet_mesh import COVERED, sheet_mesh
 
 LEAST_POINTS = 12
+LINE = 1e-6  # of the spread along it: points that spread less across it lie on a line
 
 
 class Sheet(NamedTuple):
@@ -72,6 +74,7 @@ def sheet_of(
     centre = cloud.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
     cloud = (cloud - centre) / size
+    _check_no_line(cloud)
     asked = None if hole_length is None else hole_length / size
     doing("connecting neighbours to a mesh")
     mesh, length = sheet_mesh(cloud, _given_faces(points, clean, faces), asked)
@@ -107,6 +110,12 @@ def sheet_of(
         area=mesh.area * size**2,
         counts=counts,
     )
+
+
+def _check_no_line(cloud: np.ndarray) -> None:
+    spread = principal_frame(cloud)[1]
+    if spread[1] < LINE * spread[0]:
+        raise ValueError("points must make a surface, but lie on a line; give points on both sides of it.")
 
 
 def _nearest(points: np.ndarray, cloud: np.ndarray) -> Int[np.ndarray, " points"]:
