@@ -20,7 +20,7 @@ from jaxfit._scan._topology import RoughError, largest_piece, sheet_loops
 
 MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
-LEVEL_NODES = 12_000  # of a mesh over a plane: hardly more than control points, or it is rougher than any fit
+LEVEL_NODES = 10_000  # of a mesh over a plane: hardly more than control points, or it is rougher than any fit
 HOLE_SPACINGS = 2.0  # and so many of those distances make a hole
 GAP = 0.25  # of the hole length: farther pieces of the mesh are off the sheet,
 FLOCK = 10  # and so are those of at least so many nodes; fewer are what the mesh has left open
