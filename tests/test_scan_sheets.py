@@ -29,6 +29,11 @@ def cylinder(length=3.0, around=24):
     return np.stack([np.cos(angle), np.sin(angle), height], axis=2).reshape(-1, 3)
 
 
+def half_cylinder():
+    points = cylinder()
+    return points[points[:, 1] > -1e-9]
+
+
 def sphere(count=500):
     """Evenly spread points of the unit sphere."""
     k = np.arange(count) + 0.5
@@ -119,11 +124,12 @@ def test_units_offsets_and_order_do_not_matter():
         (cylinder(), "runs round like a tube"),
         (sphere(), "closed like a sphere"),
         (np.concatenate([square(), square() + np.array([3.0, 0, 0])]), "several pieces"),
+        (np.concatenate([half_cylinder(), half_cylinder() + np.array([6.0, 0, 0])]), "several pieces"),
         (open_torus(), "1 handle "),
         (square(3), "at least 12"),
         (square() * [1, 1e-9, 0] + [5e5, 5e6, 0], "lie on a line"),
     ],
-    ids=["tube", "sphere", "two pieces", "handle", "few", "line"],
+    ids=["tube", "sphere", "two pieces", "two shells", "handle", "few", "line"],
 )
 def test_what_is_no_sheet_is_said(points, sentence):
     with pytest.raises(ValueError, match=sentence):
@@ -208,3 +214,9 @@ def test_faces_of_a_large_file_tell_sheets_apart_that_are_nearer_than_the_nodes(
     place = sheet.places[:, 0] * sheet.size
     place = place if np.corrcoef(place, along)[0, 1] > 0 else place.max() - place
     assert np.abs(place - along - np.median(place - along)).max() < 1  # the layers are 6 apart and more
+
+
+@pytest.mark.parametrize("count", [12, 30, 100, 400])
+def test_points_all_over_the_place_are_no_sheet(count):
+    with pytest.raises(ValueError, match="points must"):
+        sheet_of(np.random.default_rng(0).normal(size=(count, 3)))

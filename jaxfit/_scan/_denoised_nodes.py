@@ -1,5 +1,6 @@
 """Nodes for clouds whose noise is as large as the distances between points: fewer ones, on planes of many."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,9 @@ from jaxfit._scan._even_choice import even_choice
 
 NEIGHBOURS = 16  # of a point, whose plane tells its noise
 NOISY = 0.1  # of the spacing: usual distance from that plane, from which on a mesh of all points fails
-ROUNDS = 3  # each with half as many nodes along either direction as the one before,
-PER_NODE = 6  # and planes of so many points for each point that a node stands for
+SHARES = 4, 16, 64  # points that a node stands for, tried one after the other
+PER_NODE = 6  # times as many make the plane that a node is moved to
+LEAST_NODES = 40
 ENTRIES = 1 << 20  # neighbours at once
 
 
@@ -23,11 +25,12 @@ def is_noisy(points: Float[Any, "points 3"]) -> bool:
     return bool(np.median(away) > NOISY * spacing)
 
 
-def denoised_nodes(points: Float[Any, "points 3"], round: int) -> Float[Any, "nodes 3"]:
-    """About one node for 4 points in the first round, 16 in the second and so on."""
-    share = 4**round
-    moved = on_planes(points, PER_NODE * share)
-    return moved[even_choice(moved, max(len(points) // share, 1))]
+def denoised_nodes(points: Float[Any, "points 3"]) -> Iterator[Float[Any, "nodes 3"]]:
+    """About one node for 4 points, then one for 16 and so on."""
+    for share in SHARES:
+        if len(points) >= LEAST_NODES * share:
+            moved = on_planes(points, PER_NODE * share)
+            yield moved[even_choice(moved, len(points) // share)]
 
 
 def on_planes(points: Float[Any, "points 3"], count: int) -> Float[Any, "points 3"]:

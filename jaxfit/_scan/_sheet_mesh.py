@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxfit._progress_line import doing
 from jaxfit._scan._coarse_mesh import coarse_faces
-from jaxfit._scan._denoised_nodes import ROUNDS, denoised_nodes, is_noisy
+from jaxfit._scan._denoised_nodes import denoised_nodes, is_noisy
 from jaxfit._scan._even_choice import even_choice
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
@@ -62,6 +62,8 @@ def _by_neighbours(
     found = neighbourhood_mesh(nodes, reach)
     if _coverage(nodes, found) < COVERED:
         found = neighbourhood_mesh(nodes, reach, least_votes=1)
+    if len(found) > COVERED * 2 * len(nodes):
+        largest_piece(nodes, found)  # says so if there are several
     if (covered := _coverage(nodes, found)) < COVERED:
         raise RoughError(
             f"points must lie on one sheet, but neighbours agree on a surface for only "
@@ -76,9 +78,9 @@ def _without_noise(
     cloud: np.ndarray, nodes: np.ndarray, length: float | None, error: RoughError
 ) -> tuple[SheetMesh, float]:
     """The mesh of fewer nodes, each where many points say; raises `error` where it was not noise."""
-    for fewer in range(1, ROUNDS + 1 if is_noisy(nodes) else 1):
+    for level in denoised_nodes(nodes) if is_noisy(nodes) else ():
         try:
-            return _by_neighbours(cloud, denoised_nodes(nodes, fewer), length, noise=False)
+            return _by_neighbours(cloud, level, length, noise=False)
         except RoughError:
             continue
     raise error
