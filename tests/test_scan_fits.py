@@ -72,6 +72,11 @@ def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
     assert again.stats["points_read"] == len(points) + 12
     assert (again.stats["duplicates"], again.stats["non_finite"], again.stats["outliers"]) == (7, 2, 3)
     assert again.errors.shape == (len(points) + 12,)
+    inside = np.asarray(again.inside)
+    assert (inside[:7] == inside[9:16]).all()
+    assert inside[9:16].any()
+    assert not inside[7:9].any()
+    assert not inside[-3:].any()
     assert np.isnan(again.errors[7:9]).all()
     assert np.isfinite(np.delete(np.asarray(again.errors), [7, 8])).all()
     assert again.maximum_error < 1e-2 < again.errors[-1]

@@ -47,7 +47,11 @@ def fit_scan(
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
         fit = fit_cloud(cloud, nets.base(net), method, request | {"start": nets.feet(net)})
-    fit = dataclasses.replace(fit, stats=fit.stats | {"counted": weights > 0})
+    # Duplicates add nothing to the fit, but are on the sheet as well.
+    same = (points[sheet.number[sheet.nearest]] == cloud).all(axis=1) & sheet.on_sheet[sheet.nearest]
+    counted = finite.copy()
+    counted[finite] = same & (given[finite] > 0)
+    fit = dataclasses.replace(fit, stats=fit.stats | {"counted": counted})
     return _with_loops(_for_all(fit, finite), sheet, sheet.layout(net, order))
 
 
