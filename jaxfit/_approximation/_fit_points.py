@@ -84,9 +84,10 @@ def fit_points(
         `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
         `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
         that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their normals to the
-        mean with their neighbours first, for noise makes a mesh rough and its area too large.
-        `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left out have errors
-        as well, but do not count; where they are not finite u, v and errors are NaN.
+        mean with their neighbours first, for noise makes a mesh rough and its area too large. `counted` says
+        which points are on the sheet. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points
+        that were left out have errors as well, but do not count; where they are not finite u, v and errors
+        are NaN.
 
     Raises
     ------
@@ -105,9 +106,10 @@ def fit_points(
     each way, again and again, each fit starting from the one before. That ends where the tolerances are met.
     It also ends where the tenth of the points that was held out comes no nearer to the surface, by 2 % of its
     average error, as the net gets finer: what is left is noise, and the net before is taken. And it ends
-    with three points for a control point. The last fit is one to all points. Each net takes at most
-    20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than 20,000 points as
-    many as the net needs, 48 for a control point, choose it.
+    with three points for a control point, or with 200 of these each way, without a boundary 96. The last fit
+    is one to all points. Each net takes at most 20 iterations, the last up to `max_steps` where the
+    tolerances can be met. Of more than 20,000 points as many as the net needs, 48 for a control point, choose
+    it.
 
     Without a boundary each point has its Delaunay star in its own tangent plane, and triangles on which
     stars agree make the mesh. It is laid out flat with little distortion and no flipped triangle (symmetric

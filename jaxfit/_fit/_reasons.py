@@ -32,8 +32,8 @@ class RESULTS(eqx.Enumeration):
         "tolerances is noise, or detail between the points; loosen the tolerances."
     )
     net_exhausted = (
-        "the tolerances are not met with as many control points as the number of points allows; loosen them, "
-        "or pass a net or more points."
+        "the tolerances are not met with the largest net that is tried for this number of points; loosen "
+        "them, or pass a net."
     )
     diverged = (
         "the computation produced numbers that are not finite or errors that grow, and went back to the last "

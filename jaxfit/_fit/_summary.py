@@ -135,9 +135,11 @@ def with_folds(fit: Any, sentence: str) -> str:
             "this is not where they end; if the method holds it, free it by border=FreeBorder()."
         )
     if missed and fit.stats.get("points_out_of_reach", 0) > 0:
+        count = int(fit.stats["points_out_of_reach"])
+        points = f"{count:,} points are" if count > 1 else "1 point is"
         sentence = (
-            f"{sentence} {int(fit.stats['points_out_of_reach']):,} points are out of reach of a surface of "
-            "this net that does not fold; insert knots, or look whether they lie on another sheet."
+            f"{sentence} {points} out of reach of a surface of this net that does not fold; insert knots, or "
+            "look whether they lie on another sheet."
         )
     if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
