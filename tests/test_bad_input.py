@@ -349,6 +349,7 @@ def test_an_interrupted_command_is_quiet(tmp_path, seconds):
             text=True,
         )
     while "jaxfit._interrupt" not in imports.read_text():  # before it Python itself starts
+        assert running.poll() is None, imports.read_text()
         time.sleep(0.02)
     time.sleep(seconds)
     running.send_signal(signal.SIGINT)

@@ -64,10 +64,12 @@ def _outset(region: Any, points: Float[Any, "some 2"], nodes: int) -> float:
 
     They lie evenly in a strip around the nodes: half of them in its inner half.
     """
+    if nodes > MOST_SINGLE * len(points):
+        return 0.0
     shapely = import_shapely()
     shapely.prepare(region)
     outside = points[~shapely.contains_xy(region, *points.T)]
-    if nodes > MOST_SINGLE * len(points) or not len(outside):
+    if not len(outside):
         return 0.0
     return 2.0 * float(np.median(shapely.distance(region, shapely.points(outside))))
 
