@@ -28,7 +28,7 @@ POINTS_A_CONTROL_POINT = 3  # at least, of any net
 ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
 # Nets share a program where each direction has room for the same number of control points: compiling costs
 # more than the surplus ones.
-ROOMS = 24, 48, 96, MOST_SIZE
+ROOMS = 24, 50, 96  # beyond, a net has no more than it needs
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
