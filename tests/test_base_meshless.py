@@ -60,9 +60,9 @@ def test_gaps_between_scan_lines_take_no_search_among_all_points(monkeypatch):
     points = points + np.random.default_rng(0).normal(0, [1e-4, 2e-3], points.shape)
     entries, search = [], _delaunay_stars._stars_among
 
-    def counted(planes, rows, members, filled):
+    def counted(planes, rows, members, filled, straight):
         entries.append(members.size)
-        return search(planes, rows, members, filled)
+        return search(planes, rows, members, filled, straight)
 
     monkeypatch.setattr(_delaunay_stars, "_stars_among", counted)
     star = stars(points, 16)

@@ -43,9 +43,18 @@ class Planes(NamedTuple):
     normals: np.ndarray | None  # (points, 3)
 
 
-def stars(points: Float[Any, "points d"], count: int, fixed: int = 0, planes: Planes | None = None) -> Stars:
+def stars(
+    points: Float[Any, "points d"],
+    count: int,
+    fixed: int = 0,
+    planes: Planes | None = None,
+    straight: float = COCIRCULAR,
+) -> Stars:
     """The stars among about `count` neighbours, d >= 2, in given planes or in those of as many neighbours; no
     two points may coincide.
+
+    Where an angle of a hull is straight, to a sine of `straight`, points lie on a circle, and all are
+    neighbours. Of two in the same direction, to that sine, the farther one is none.
 
     Points with a wide gap, except the first `fixed` ones, get a second search among all points that have one,
     and a third one if the gap stays: the points on the rim of a hole are then neighbours across it. Otherwise
@@ -53,7 +62,7 @@ def stars(points: Float[Any, "points d"], count: int, fixed: int = 0, planes: Pl
     """
     members, filled = neighbourhoods(points, count)
     planes = _planes(points, members, filled) if planes is None else planes
-    star = _stars_among(planes, np.arange(len(points)), members, filled)
+    star = _stars_among(planes, np.arange(len(points)), members, filled, straight)
     gaping = np.flatnonzero((star.angle > WIDEST).any(axis=1))
     for across, widest in ACROSS:
         rows = gaping[(gaping >= fixed) & (star.angle[gaping] > widest).any(axis=1)]
@@ -62,17 +71,19 @@ def stars(points: Float[Any, "points d"], count: int, fixed: int = 0, planes: Pl
         for k in range(0, len(rows), at_once):
             part = rows[k : k + at_once]
             members, filled = _with_nearest(star, points, part, gaping, most)
-            star = _replaced(star, part, _stars_among(planes, part, members, filled))
+            star = _replaced(star, part, _stars_among(planes, part, members, filled, straight))
     return star
 
 
-def _stars_among(planes: Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray) -> Stars:
+def _stars_among(
+    planes: Planes, rows: np.ndarray, members: np.ndarray, filled: np.ndarray, straight: float
+) -> Stars:
     """The stars of the points `rows` among given ones."""
     plane = _in_tangent_planes(planes, rows, members, filled)
     angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
     order = np.argsort(angle, axis=1, kind="stable")
     members, filled, plane = _reordered((members, filled, plane), order)
-    members, filled, plane = _hulls(members, filled, plane)
+    members, filled, plane = _hulls(members, filled, plane, straight)
     return Stars(members, filled, plane, _angles_between(plane, filled))
 
 
@@ -193,7 +204,7 @@ def _reordered(arrays: tuple[np.ndarray, ...], order: np.ndarray) -> list[np.nda
 
 
 def _hulls(
-    members: np.ndarray, filled: np.ndarray, plane: np.ndarray
+    members: np.ndarray, filled: np.ndarray, plane: np.ndarray, straight: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drop the neighbours that are no Delaunay neighbours."""
     square = _dot(plane, plane)
@@ -205,9 +216,9 @@ def _hulls(
         turn = _cross(part - before, after - part)
         size = _norm(part - before) * _norm(after - part)
         # Across half a turn or more there is no triangle that could hide the point.
-        opposite = _cross(before, after) <= COCIRCULAR * _norm(before) * _norm(after)
-        dropped = there & ((~opposite & (turn < -COCIRCULAR * size)) | _is_hidden(part, before))
-        dropped |= there & _is_hidden(part, after)
+        opposite = _cross(before, after) <= straight * _norm(before) * _norm(after)
+        dropped = there & ((~opposite & (turn < -straight * size)) | _is_hidden(part, before, straight))
+        dropped |= there & _is_hidden(part, after, straight)
         # A point whose two neighbours are one and the same stays.
         dropped &= (there.sum(axis=1) > 2)[:, None]
         changed = dropped.any(axis=1)
@@ -228,10 +239,10 @@ def cyclic_neighbours(
     return [_reordered((x,), (place + shift) % count)[0] for shift in (-1, 1)]
 
 
-def _is_hidden(x: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _is_hidden(x: np.ndarray, other: np.ndarray, straight: float) -> np.ndarray:
     """Whether x, inverted, is in the same direction as the other, and was farther away."""
     size = _norm(x) * _norm(other)
-    along = (np.abs(_cross(x, other)) <= COCIRCULAR * size) & (_dot(x, other) > 0)
+    along = (np.abs(_cross(x, other)) <= straight * size) & (_dot(x, other) > 0)
     return along & (_norm(x) < _norm(other))
 
 

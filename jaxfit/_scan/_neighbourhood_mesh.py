@@ -11,6 +11,7 @@ from jaxfit._scan._manifold import Faces, longest_edges, manifold
 PLANE_NEIGHBOURS = 16  # of a point, that make its tangent plane
 NEIGHBOURS = 24  # among which its star is searched: near another sheet some are on that
 ALIKE = 0.5  # least cosine between normals of corners that are surely on one sheet
+STRAIGHT = 2e-2  # sine of an angle of a star's hull: points of a grid of whole numbers are on a circle still
 WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
 
 
@@ -19,12 +20,12 @@ def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_vote
 
     Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
-    come first, then those in at least `least_votes` that fit in between, the shortest first. On an exact grid
-    that is bent both halves of a square may be in one star each; among noise such triangles make bridges.
-    Triangles between corners whose normals differ much come last: they may join sheets that face each other.
+    come first, then those in at least `least_votes` that fit in between, the shortest first. The tangent planes
+    of the corners of a square, on a grid that is bent, would disagree on its diagonal, so STRAIGHT lets all
+    four see both: the shorter one is taken. Among noise triangles in one star make bridges. Triangles between corners whose normals differ much come last: they may join sheets that face each other.
     """
     planes = supported_planes(points, PLANE_NEIGHBOURS)
-    star = stars(points, NEIGHBOURS, fixed=len(points), planes=planes)
+    star = stars(points, NEIGHBOURS, fixed=len(points), planes=planes, straight=STRAIGHT)
     faces, votes = _candidates(star)
     longest = longest_edges(points, faces)
     chosen = (longest <= length) & (votes >= least_votes)
