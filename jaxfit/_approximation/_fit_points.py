@@ -74,8 +74,7 @@ def fit_points(
         all kept.
     method, options
         As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors,
-        adjoint. Without a boundary there are no `start` and no `adjoint`, and `errors` is LocalFeet() by
-        default.
+        adjoint. Without a boundary there are no `start` and no `adjoint`.
 
     Returns
     -------

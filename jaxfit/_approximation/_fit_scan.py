@@ -9,7 +9,7 @@ import numpy as np
 from jaxfit._approximation._approximate import default_method
 from jaxfit._approximation._checked_scan import ScanInput
 from jaxfit._approximation._cloud_fit import fit_cloud
-from jaxfit._approximation._errors import LocalFeet
+from jaxfit._approximation._errors import GlobalFeet, LocalFeet
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
@@ -37,8 +37,9 @@ def fit_scan(
     weights = np.zeros(len(points))
     on_sheet = sheet.number[sheet.on_sheet]
     weights[on_sheet] = given[on_sheet]
-    errors = LocalFeet() if request["errors"] is None else request["errors"]
-    request = request | {"weights": weights[finite], "errors": errors}
+    measured = request["errors"]
+    # Loops need feet on the own side of a thin part, which the nearest ones may not be.
+    request = request | {"weights": weights[finite], "errors": measured or LocalFeet()}
     cloud, nets, method = points[finite], SheetNets(sheet, order), default_method(method)
     if net is None and grows:
         growth = NetGrowth(cloud, nets, method, request)
@@ -52,7 +53,27 @@ def fit_scan(
     counted = finite.copy()
     counted[finite] = same & (given[finite] > 0)
     fit = dataclasses.replace(fit, stats=fit.stats | {"counted": counted})
-    return _with_loops(_for_all(fit, finite), sheet, sheet.layout(net, order))
+    fit = _with_loops(fit, finite, sheet, sheet.layout(net, order))
+    if measured is None:
+        fit = _at_nearest_feet(fit, cloud, weights[finite] > 0)
+    return _for_all(fit, finite)
+
+
+def _at_nearest_feet(fit: Fit, cloud: np.ndarray, counted: np.ndarray) -> Fit:
+    """With errors at the nearest feet on the whole surface."""
+    diagonal = fit.stats["diagonal"]
+    known = fit.u, fit.v, np.asarray(fit.errors) * diagonal, np.ones(len(cloud), bool)
+    u, v, distance, _ = GlobalFeet().feet(fit.surface, cloud, known, at_feet=True)
+    dtype = np.asarray(fit.errors).dtype
+    errors = np.asarray(distance, dtype) / diagonal
+    arrays = {
+        "u": np.asarray(u, dtype),
+        "v": np.asarray(v, dtype),
+        "errors": errors,
+        "average_error": errors[counted].mean(dtype=dtype),
+        "maximum_error": errors[counted].max(),
+    }
+    return dataclasses.replace(fit, **jax.device_put(arrays))
 
 
 def _for_all(fit: Fit, finite: np.ndarray) -> Fit:
@@ -67,9 +88,10 @@ def _for_all(fit: Fit, finite: np.ndarray) -> Fit:
     return dataclasses.replace(fit, **jax.device_put(arrays))
 
 
-def _with_loops(fit: Fit, sheet: Sheet, layout: Layout) -> Fit:
+def _with_loops(fit: Fit, finite: np.ndarray, sheet: Sheet, layout: Layout) -> Fit:
     """With the rim and the holes in the parameters of its surface, and what was found on the way."""
-    feet = np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1)[sheet.number]
+    number = (np.cumsum(finite) - 1)[sheet.number]
+    feet = np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1)[number]
     nodes = node_feet(fit.surface, sheet, feet)
     loops = trim_loops(fit.surface, sheet, layout.sides, nodes, feet)
     domain = [tuple(float(x) for x in limits) for limits in fit.surface.domain]

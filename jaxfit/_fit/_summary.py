@@ -25,12 +25,13 @@ def facts(fit: Any) -> dict[str, str]:
     """Names and values for a table: net, order, iterations, errors in per cent, how regular the surface is,
     and why the fit stopped.
     """
+    some = ", without points left out" if _left_out(fit) else ""
     return {
         "net": "{} x {}".format(*fit.surface.shape),
         "order": "{} x {}".format(*fit.surface.order),
         "iterations": str(int(fit.stats["num_steps"])),
-        "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal",
-        "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal",
+        "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal{some}",
+        "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal{some}",
         **_cleaning_facts(fit),
         **_trim_facts(fit),
         **_regularity_facts(fit),
@@ -67,11 +68,27 @@ _LEFT_OUT = {
 
 def _cleaning_facts(fit: Any) -> dict[str, str]:
     """How many points were read, and why some were left out."""
-    counts = {name: int(fit.stats.get(key, 0)) for key, name in _LEFT_OUT.items()}
     if "points_read" not in fit.stats:
         return {}
-    reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
-    return {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
+    counts = _left_out(fit)
+    reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items())
+    said = {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
+    if counts:
+        average, maximum = errors_of_all(fit)
+        said["all points"] = f"average error {average:.4g} %, maximum {maximum:.4g} %, with those left out"
+    return said
+
+
+def _left_out(fit: Any) -> dict[str, int]:
+    """How many points, and why."""
+    counts = {name: int(fit.stats.get(key, 0)) for key, name in _LEFT_OUT.items()}
+    return {name: count for name, count in counts.items() if count}
+
+
+def errors_of_all(fit: Any) -> tuple[float, float]:
+    """Average and maximum in per cent of the diagonal, over all points that are finite."""
+    errors = 100 * np.asarray(fit.errors, float)
+    return float(np.nanmean(errors)), float(np.nanmax(errors))
 
 
 def _trim_facts(fit: Any) -> dict[str, str]:

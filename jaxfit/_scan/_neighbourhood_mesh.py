@@ -20,9 +20,10 @@ def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_vote
 
     Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
-    come first, then those in at least `least_votes` that fit in between, the shortest first. The tangent planes
-    of the corners of a square, on a grid that is bent, would disagree on its diagonal, so STRAIGHT lets all
-    four see both: the shorter one is taken. Among noise triangles in one star make bridges. Triangles between corners whose normals differ much come last: they may join sheets that face each other.
+    come first, then those in at least `least_votes` that fit in between, the shortest first. On a bent grid
+    the corners of a square would disagree on its diagonal, each in its own plane, so STRAIGHT lets all four
+    see both, and the shorter one is taken. Among noise triangles in one star make bridges. Triangles between
+    corners whose normals differ much come last: they may join sheets that face each other.
     """
     planes = supported_planes(points, PLANE_NEIGHBOURS)
     star = stars(points, NEIGHBOURS, fixed=len(points), planes=planes, straight=STRAIGHT)

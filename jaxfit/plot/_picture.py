@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfit._fit._summary import errors_of_all
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit._trimmed._trimmed_surface import host_loops
 from jaxfit.io._output import write_atomically
@@ -166,13 +167,14 @@ def _draw_errors(axes: "Axes", fit: Any, errors: np.ndarray, view: View) -> None
     _turn_like_the_surface(axes, fit.surface, view)
     bar = axes.figure.colorbar(drawn, ax=axes, extend="max", pad=0.02)
     bar.set_label(label)
-    caption = (
-        f"average {100 * float(fit.average_error):.3g} %, "
-        f"maximum {100 * float(fit.maximum_error):.3g} % of the diagonal"
-    )
+    average, maximum = 100 * float(fit.average_error), 100 * float(fit.maximum_error)
+    if trimmed is not None:  # and points may have been left out
+        average, maximum = errors_of_all(fit)
+    caption = f"average {average:.3g} %, maximum {maximum:.3g} % of the diagonal"
     if errors.size and trimmed is not None:
+        finite = int(np.isfinite(np.asarray(fit.errors)).sum())
         within = f"inside the loops: average {errors.mean():.3g} %, maximum {errors.max():.3g} %"
-        caption = f"{within}\nall {inside.size:,} points: {caption}"
+        caption = f"{within}\nall {finite:,} points: {caption}"
     folds = len(folds_in(of_fit(fit), fit.regularity))
     axes.set_title(caption + ("\ncrosses: folds" if folds else ""), fontsize=11)
 
