@@ -8,6 +8,7 @@ import pytest
 from helpers import data, diagonal
 
 import jaxfit as jf
+from jaxfit._scan import is_nodata
 
 shapely = pytest.importorskip("shapely")
 
@@ -83,6 +84,28 @@ def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
     at = np.asarray(fit.surface(fit.u, fit.v))
     away = jf.closest_point(again.surface, at).distance
     assert np.mean(away) < 2e-4 * diagonal(points)
+
+
+@pytest.mark.parametrize("value", [-9999.0, -32768.0, 3.4028235e38])
+def test_numbers_that_stand_for_no_data_are_left_out_and_counted(fit, value):
+    points = scan()
+    marked = points.copy()
+    marked[:, 2] = np.where(np.hypot(points[:, 0] + 0.5, points[:, 1]) < 0.3, value, points[:, 2])
+    count = int((marked[:, 2] == value).sum())
+    again = jf.fit_points(np.concatenate([marked, [[np.nan, 0, 0]]]), net=(12, 12), tol_average=1e-4)
+    assert count > 50
+    assert (again.stats["nodata"], again.stats["non_finite"], again.stats["outliers"]) == (count, 1, 0)
+    assert len(again.trimmed.loops) == 3
+    assert again.average_error < 1e-4
+    assert f"{count} without data" in str(again)
+
+
+def test_a_height_that_looks_like_no_data_among_others_is_data():
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 90, 20), np.linspace(0, 90, 20), indexing="ij"))
+    assert jf.fit_points(np.stack([x, y, 990 + x / 5], axis=1), net=(6, 6), max_steps=2).stats["nodata"] == 0
+    for value, others in ((999.0, 980.0), (9999.0, 9990.0), (-9999.0, -9990.0)):
+        heights = np.where(x > 40, value, others + x / 5)
+        assert not is_nodata(np.stack([x, y, heights], axis=1)).any()
 
 
 def test_noise_makes_no_sheet_larger(fit):

@@ -7,12 +7,14 @@ import numpy as np
 
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._checks import as_points, check_number, is_concrete
+from jaxfit._scan import is_nodata
 
 
 class ScanInput(NamedTuple):
     """Points that may not be finite, triangles between them, and what counts as a hole."""
 
     points: np.ndarray  # (points, 3), float64
+    nodata: int  # how many of these are NaN now for a number that stands for no data
     faces: np.ndarray | None  # (faces, 3)
     hole_length: float | None
 
@@ -33,6 +35,8 @@ def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: An
             "it out, or pass a boundary."
         )
     cloud = _points_with_gaps(points)
+    missing = is_nodata(cloud)
+    cloud = np.where(missing[:, None], np.nan, cloud)
     if hole_length is not None:
         check_number("hole_length", hole_length, 0.0)
         if not hole_length > 0:
@@ -41,6 +45,7 @@ def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: An
             )
     return ScanInput(
         cloud,
+        int(missing.sum()),
         None if faces is None else _checked_faces(faces, len(cloud)),
         None if hole_length is None else float(hole_length),
     )

@@ -79,14 +79,15 @@ def fit_points(
     Returns
     -------
     Fit
-        Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
+        Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`, `nodata`,
         `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
         `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
         that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their normals to the
         mean with their neighbours first, for noise makes a mesh rough and its area too large. `counted` says
         which points are on the sheet. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points
         that were left out have errors as well, but do not count; where they are not finite u, v and errors
-        are NaN.
+        are NaN. A coordinate that stands for no data (nines such as -9999, the ends of 16 bits, beyond 1e20)
+        makes a point `nodata`, which counts as not finite, if it is far from all others.
 
     Raises
     ------

@@ -52,7 +52,8 @@ def fit_scan(
     same = (points[sheet.number[sheet.nearest]] == cloud).all(axis=1) & sheet.on_sheet[sheet.nearest]
     counted = finite.copy()
     counted[finite] = same & (given[finite] > 0)
-    fit = dataclasses.replace(fit, stats=fit.stats | {"counted": counted})
+    counts = sheet.counts | {"nodata": scan.nodata, "non_finite": sheet.counts["non_finite"] - scan.nodata}
+    fit = dataclasses.replace(fit, stats=fit.stats | counts | {"counted": counted})
     fit = _with_loops(fit, finite, sheet, sheet.layout(net, order))
     if measured is None:
         fit = _at_nearest_feet(fit, cloud, weights[finite] > 0)
@@ -97,7 +98,6 @@ def _with_loops(fit: Fit, finite: np.ndarray, sheet: Sheet, layout: Layout) -> F
     domain = [tuple(float(x) for x in limits) for limits in fit.surface.domain]
     on_border = np.any([np.isin(x, limits) for x, limits in zip(feet.T, domain, strict=True)], axis=0)
     found = {
-        **sheet.counts,
         "holes": len(loops) - 1,
         "hole_length": sheet.hole_length,
         "sheet_area": sheet.area,

@@ -59,6 +59,7 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
 
 
 _LEFT_OUT = {
+    "nodata": "without data",
     "non_finite": "not finite",
     "duplicates": "duplicates",
     "outliers": "outliers",

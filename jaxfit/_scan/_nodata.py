@@ -1,0 +1,26 @@
+"""Points whose coordinates are a number that stands for no data."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# What rasters and instruments write where they have not measured: numbers of nines, the ends of 16 bits, and
+# anything near those of single precision.
+USUAL = -999.0, *(sign * x for x in (9999.0, 99999.0, 999999.0, 32767.0, 32768.0) for sign in (-1, 1))
+HUGE = 1e20
+APART = 2.0  # times the range of all other coordinates: farther than that from these
+
+
+def is_nodata(points: Float[Any, "points d"]) -> Bool[np.ndarray, " points"]:
+    """Where a coordinate is such a number, far from all others."""
+    with np.errstate(invalid="ignore"):
+        marked = (np.isin(points, USUAL) | (np.abs(points) >= HUGE)) & np.isfinite(points)
+    found = np.zeros(len(points), bool)
+    for x, some in zip(points.T, marked.T, strict=True):
+        others = x[np.isfinite(x) & ~some]
+        if not some.any() or not len(others):
+            continue
+        low, high = float(others.min()), float(others.max())
+        found |= some & (np.maximum(x - high, low - x) > APART * (high - low))
+    return found
