@@ -223,3 +223,9 @@ def test_loops_and_history_are_drawn(tmp_path):
     axes = history(fit, tmp_path / "h.png").axes[0]
     np.testing.assert_allclose(axes.lines[0].get_ydata(), 300 * errors)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["h.png", "l.png"]
+
+
+def test_a_surface_with_fewer_samples_than_pixels_has_no_gaps(monkeypatch):
+    monkeypatch.setattr("jaxfit.plot._render._MOST", 150)
+    drawn = render(wavy_surface())[0][..., 3] > 0
+    np.testing.assert_array_equal(binary_fill_holes(drawn), drawn)

@@ -1,6 +1,7 @@
 """A shaded picture of a surface without a mesh: many points, the nearest one wins each pixel."""
 
 from collections.abc import Callable
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -50,13 +51,13 @@ def render(
     framed = seen[kept] if kept.any() else seen.reshape(-1, 3)
     size = np.ptp(framed[:, :2], axis=0).max()
     pixel = max(size, np.finfo(float).tiny) / (_PIXELS - 1)
-    us, vs = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
+    (us, step_u), (vs, step_v) = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
     # The view is affine: applied to the control points, it applies to the surface.
     net = (view(_net(surface)) - framed.min(axis=0)) / pixel
     points = _Samples(surface, us, vs)
     kept = shown(part, us, vs)
     x, y, z = (points(net[..., c])[kept] for c in range(3))
-    keys = _nearest(x, y, z, np.flatnonzero(kept))
+    keys = _nearest(x, y, z, np.flatnonzero(kept), int(np.ceil(max(step_u, step_v))))
     filled = keys >= 0
     index = keys[filled] & ((1 << _INDEX_BITS) - 1)
     image = np.zeros((*keys.shape, 4), np.float32)
@@ -112,12 +113,14 @@ def _net(surface: BSplineSurface) -> Float[np.ndarray, "nu nv 3"]:
     return np.concatenate([net, np.zeros((*net.shape[:2], 3))], axis=-1)[..., :3]
 
 
-def _refine(at: np.ndarray, seen: np.ndarray, pixel: float) -> np.ndarray:
-    """Parameters spaced evenly in the picture, where the first axis of `seen` belongs to `at`."""
+def _refine(at: np.ndarray, seen: np.ndarray, pixel: float) -> tuple[np.ndarray, float]:
+    """Parameters spaced evenly in the picture, where the first axis of `seen` belongs to `at`, and the
+    distance of their points in raw pixels, at most.
+    """
     steps = np.linalg.norm(np.diff(seen, axis=0), axis=-1).max(axis=1) / pixel
     along = np.append(0.0, np.cumsum(np.maximum(steps, 1e-3)))
     count = int(np.clip(_DENSITY * along[-1], 200, _MOST))
-    return np.interp(np.linspace(0, along[-1], count), along, at)
+    return np.interp(np.linspace(0, along[-1], count), along, at), along[-1] / (count - 1)
 
 
 def _heights(surface: BSplineSurface, view: View, points: _Samples, index: np.ndarray) -> np.ndarray | None:
@@ -185,9 +188,10 @@ def _nearest(
     y: Float[np.ndarray, " k"],
     z: Float[np.ndarray, " k"],
     index: Int[np.ndarray, " k"],
+    gap: int,
 ) -> Int[np.ndarray, "height width"]:
     """For every raw pixel a key of the sample in front: its depth in the upper bits, its number in `index` in
-    the lower ones. -1 is an empty pixel.
+    the lower ones. -1 is an empty pixel. Samples of a sheet may be `gap` pixels apart.
     """
     column = np.rint(x + (2 - x.min())).astype(np.int32)
     row = np.rint((y.max() + 2) - y).astype(np.int32)
@@ -195,22 +199,26 @@ def _nearest(
     depth = ((z - z.min()) * _DEPTHS).astype(np.int64)
     keys = np.full((height, width), -1)
     np.maximum.at(keys.ravel(), row * width + column, (depth << _INDEX_BITS) + index)
-    for _ in range(2):
-        keys = _close_gaps(keys)
+    for reach in (gap, 1):
+        keys = _close_gaps(keys, reach)
     return keys
 
 
-def _close_gaps(keys: Int[np.ndarray, "height width"]) -> Int[np.ndarray, "height width"]:
-    """Fill a pixel, or cover what shows through it from behind, with its nearest neighbour.
+def _close_gaps(keys: Int[np.ndarray, "height width"], reach: int) -> Int[np.ndarray, "height width"]:
+    """Fill a pixel, or cover what shows through it from behind, with the nearest one within `reach`.
 
-    Only pixels with neighbours on opposite sides count as gaps, so that outlines do not grow.
+    Only pixels with some on opposite sides count as gaps, so that outlines do not grow.
     """
     height, width = keys.shape
-    padded = np.pad(keys, 1, constant_values=-1)
+    padded = np.pad(keys, reach, constant_values=-1)
+
+    def shifted(i: int, j: int) -> np.ndarray:
+        return padded[reach + i : reach + i + height, reach + j : reach + j + width]
+
     best = np.full_like(keys, -1)
-    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        ahead = padded[1 + di : 1 + di + height, 1 + dj : 1 + dj + width]
-        behind = padded[1 - di : 1 - di + height, 1 - dj : 1 - dj + width]
+    for i, j in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        ahead = reduce(np.maximum, [shifted(k * i, k * j) for k in range(1, reach + 1)])
+        behind = reduce(np.maximum, [shifted(-k * i, -k * j) for k in range(1, reach + 1)])
         best = np.maximum(best, np.minimum(ahead, behind))
     step = (4 * _DEPTHS) << _INDEX_BITS
     return np.where((best >= 0) & ((keys < 0) | (best - keys > step)), best, keys)
