@@ -199,7 +199,7 @@ def _nearest(
     depth = ((z - z.min()) * _DEPTHS).astype(np.int64)
     keys = np.full((height, width), -1)
     np.maximum.at(keys.ravel(), row * width + column, (depth << _INDEX_BITS) + index)
-    for reach in (gap, 1):
+    for reach in [gap] * gap + [1]:
         keys = _close_gaps(keys, reach)
     return keys
 
