@@ -15,7 +15,10 @@ from jaxtyping import Float
 from jaxfit._scan._manifold import Faces
 
 MOST_STEPS = 50
-ENOUGH = 2e-4  # a step that lowers the energy by less than this share is the last
+ENOUGH = 2e-4  # a step that lowers the energy by less than this share is the last,
+ISOMETRY = 4.0  # the energy of a map without distortion; unless what is above it
+LARGE = 0.1  # falls by at least this share
+NEGLIGIBLE = 1e-4  # and is more than this, as where a sheet can be rolled out flat
 LEAST_HEIGHT = 0.05  # of a triangle over its longest edge; flatter ones count as if they were so high
 NEAR_FLIP = 0.8  # of the step at which the first triangle would flip
 SHORTEST = 1e-4  # step
@@ -76,7 +79,8 @@ def isometric_maps(
             return
         places, before, now = places + step * direction, now, after
         yield places
-        if before - now < ENOUGH * now:
+        excess, fallen = now - ISOMETRY, before - now
+        if fallen < ENOUGH * now and (excess < NEGLIGIBLE or fallen < LARGE * excess):
             return
 
 
