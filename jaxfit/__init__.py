@@ -76,6 +76,7 @@ from jaxfit._parameters import Centripetal as Centripetal
 from jaxfit._parameters import ChordLength as ChordLength
 from jaxfit._parameters import curve_parameters as curve_parameters
 from jaxfit._parameters import grid_parameters as grid_parameters
+from jaxfit._program_folder import keep_programs as keep_programs
 from jaxfit._quality import Regularity as Regularity
 from jaxfit._quality import regularity as regularity
 from jaxfit._quality import zebra as zebra

@@ -7,7 +7,7 @@ import sys
 
 import jax
 
-from jaxfit._cli_cache import VARIABLE, cache_folder
+from jaxfit._program_folder import VARIABLE, keep_programs
 from jaxfit._progress_line import SETTING
 
 
@@ -34,7 +34,7 @@ def set_compile_cache(args: argparse.Namespace) -> None:
     if args.no_cache or (kept_by_jax and args.cache is None and VARIABLE not in os.environ):
         return
     try:
-        folder = cache_folder(args.cache)
+        folder = keep_programs(args.cache)
     except (OSError, RuntimeError) as error:  # RuntimeError: there is no home folder
         if not args.quiet:
             print(

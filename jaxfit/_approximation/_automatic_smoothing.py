@@ -208,7 +208,7 @@ def select_smoothing(
     return _select(rule, without, problem, surface, projection)
 
 
-@partial(compiled, static_argnames=("rule", "method"))
+@partial(compiled, kept=True, static_argnums=(0, 1))
 def _select(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:

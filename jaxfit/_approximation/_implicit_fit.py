@@ -119,7 +119,7 @@ def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInpu
     return polished_fit(rest, goal, most, end, lax.stop_gradient(inputs))
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
     """`polished`; on a CPU the fits of a batch one after the other."""
 
@@ -132,7 +132,7 @@ def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: Fit
     return whole(goal, most, end, inputs)
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit as a function of the inputs."""
     at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))

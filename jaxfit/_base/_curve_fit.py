@@ -76,7 +76,7 @@ def fit_curves(
     arrays = [jnp.asarray(np.stack(x).astype(dtype)) for x in zip(*padded, strict=True)]
     problem, feet, control = _Problem(*arrays[:5]), arrays[5], arrays[6]
     limit = jnp.asarray(np.asarray(tolerance, dtype))
-    refined = _fit_batch(problem, feet, control, limit, np.int32(max_steps), order=order)
+    refined = _fit_batch(order, problem, feet, control, limit, np.int32(max_steps))
     sizes = [len(s.control) + len(s.new_knots) for s in starts]
     controls, knots = (np.asarray(x) for x in refined)
     return [(c[:n], t[: n + order]) for c, t, n in zip(controls, knots, sizes, strict=True)]
@@ -102,9 +102,9 @@ def _padded(start: CurveStart, order: int, points: int, capacity: int) -> tuple[
     )
 
 
-@partial(compiled, static_argnames="order")
+@partial(compiled, kept=True, static_argnums=0)
 def _fit_batch(
-    problem: _Problem, feet: Array, control: Array, tolerance: Array, max_steps: Array, order: int
+    order: int, problem: _Problem, feet: Array, control: Array, tolerance: Array, max_steps: Array
 ) -> tuple[Array, Array]:
     def fit(problem: _Problem, feet: Array, control: Array) -> tuple[Array, Array]:
         infinite = jnp.asarray(jnp.inf, control.dtype)

@@ -62,7 +62,7 @@ def nearest_feet(
     return best
 
 
-@partial(compiled, static_argnames=("method",))
+@partial(compiled, kept=True, static_argnums=0)
 def _run(
     method: AbstractFootMethod,
     pieces: Pieces,

@@ -85,7 +85,7 @@ def run(
         chunk = max(1, min(2 * chunk, int(chunk * REPORT_SECONDS / max(seconds, 1e-6))))
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _advance(
     rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState
 ) -> tuple[LoopState, dict[str, Any]]:

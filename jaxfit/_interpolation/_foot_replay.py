@@ -74,7 +74,7 @@ def _attach_jvp(method: Any, order: tuple[int, int], primals: Any, tangents: Any
     return jax.jvp(partial(_replayed, method, order, fitted, path), (inputs,), tangents[2:])
 
 
-@partial(compiled, static_argnums=(0, 1))
+@partial(compiled, kept=True, static_argnums=(0, 1))
 def _replayed(method: Any, order: tuple[int, int], fitted: Fitted, path: Array, inputs: FitInputs) -> Fitted:
     """`fitted` as a function of what the fit started from."""
     u, v, knots = fitted.u, fitted.v, inputs.knots

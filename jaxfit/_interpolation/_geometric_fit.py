@@ -43,7 +43,7 @@ class Start(eqx.Module):
     extent: Array
 
 
-@partial(compiled, static_argnums=(0, 1, 2, 3))
+@partial(compiled, kept=True, static_argnums=(0, 1, 2, 3))
 def make_start(
     parametrisation: AbstractParametrisation,
     per_point: bool,

@@ -72,7 +72,7 @@ def solved_at_grid(
     )
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _solve(
     order: tuple[int, int],
     knots: Pair,

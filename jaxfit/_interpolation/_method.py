@@ -109,7 +109,7 @@ class AbstractDirectInterpolation(AbstractInterpolation):
         return fit
 
 
-@partial(compiled, static_argnums=(0, 1, 2))
+@partial(compiled, kept=True, static_argnums=(0, 1, 2))
 def _compiled(
     method: AbstractDirectInterpolation, entries: int, order: Pair, data: Any, normals: Any, frame: Frame
 ) -> tuple[Fit, Array]:

@@ -136,7 +136,7 @@ class Passes:
         return eqx.tree_at(lambda p: p.real, problem, np.arange(self.size) < count)
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _measure(
     rest: Any, numbers: Any, problem: Problem, iterate: Iterate, exact: Array
 ) -> tuple[Projection, Measured]:

@@ -158,7 +158,7 @@ def _run(
     return loop
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _advance(rest: Any, numbers: Any, problem: Problem, loop: LoopState, measured: Measured) -> LoopState:
     """Record the errors, decide, and move. The problem holds no points."""
     new = loop.next
@@ -170,7 +170,7 @@ def _advance(rest: Any, numbers: Any, problem: Problem, loop: LoopState, measure
     return record_and_move(eqx.combine(numbers, rest), problem, loop, new)
 
 
-@partial(compiled, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=0)
 def _postprocess(rest: Any, numbers: Any, problem: Problem, loop: LoopState) -> dict[str, Any]:
     """The method's statistics; the methods that go by sums return the last iterate as it is."""
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
