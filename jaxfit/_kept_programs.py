@@ -42,7 +42,7 @@ def call_kept(jitted: Any, static: int, args: tuple[Any, ...]) -> Any:
     An ordinary call where no program can be kept: no folder is set, there are several devices, or an argument
     holds what can't be named, such as a function of the user's, which might do something else tomorrow.
     """
-    key = _key(jitted.__name__, args[:static], args[static:])
+    key = _key(f"{jitted.__module__}.{jitted.__qualname__}", args[:static], args[static:])
     if folder is None or key is None:
         return jitted(*args)
     path, taken = folder / f"{jitted.__name__}-{key}{SUFFIX}", args[static:]
