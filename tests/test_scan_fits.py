@@ -108,6 +108,13 @@ def test_a_height_that_looks_like_no_data_among_others_is_data():
         assert not is_nodata(np.stack([x, y, heights], axis=1)).any()
 
 
+def test_the_ends_of_a_scroll_are_fitted_as_well():
+    angle, across = np.random.default_rng(0).uniform([[1.5 * np.pi], [0]], [[3 * np.pi], [10]], (2, 3000))
+    fit = jf.fit_points(np.stack([angle * np.cos(angle), across, angle * np.sin(angle)], axis=1), net=(24, 8))
+    assert fit.converged
+    assert fit.maximum_error < 0.007
+
+
 def test_noise_makes_no_sheet_larger(fit):
     points = scan()
     points[:, 2] += np.random.default_rng(1).normal(0, 0.008, len(points))

@@ -118,10 +118,11 @@ def fit_points(
     it, beyond the points. Clouds that are level, but too rough for neighbours to agree on a surface, as a
     survey of a town from the air, are laid out by their principal plane instead, the mesh over medians of
     their heights. Others whose noise is comparable to the distances between points are meshed from a quarter
-    of them or fewer, moved onto planes through many neighbours. Fails where two sheets are nearer to each
-    other than their points or their noise, for closed surfaces, tubes and several pieces. Of more than 30,000
-    points an even choice makes the mesh; given faces then say which of these are neighbours, by distances
-    along their edges.
+    of them or fewer, moved onto planes through many neighbours. Without a `tol_maximum` the last fit goes on
+    until no point is farther than ten times `tol_average`, if it comes to that. Fails where two sheets are
+    nearer to each other than their points or their noise, for closed surfaces, tubes and several pieces. Of
+    more than 30,000 points an even choice makes the mesh; given faces then say which of these are neighbours,
+    by distances along their edges.
 
     With a `net` the fit is differentiable in points, weights and numbers of the method, as `approximate` is.
     The base surface counts as constant then: inside, where it starts from does not matter to where the fit

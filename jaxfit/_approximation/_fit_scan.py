@@ -1,6 +1,7 @@
 """`fit_points` without a boundary: a sheet, a surface larger than it with a free border, and its loops."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from jaxfit._approximation._approximate import default_method
 from jaxfit._approximation._checked_scan import ScanInput
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import GlobalFeet, LocalFeet
-from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
+from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_everywhere, fit_growing
 from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod
@@ -42,12 +43,14 @@ def fit_scan(
     request = request | {"weights": weights[finite], "errors": measured or LocalFeet()}
     cloud, nets, method = points[finite], SheetNets(sheet, order), default_method(method)
     if net is None and grows:
-        growth = NetGrowth(cloud, nets, method, request)
+        growth = NetGrowth(cloud, nets, method, request, cleaned=True)
         fit = fit_growing(growth, nets.base(growth.net(FIRST_SIZE)))
         net = fit.surface.shape
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
-        fit = fit_cloud(cloud, nets.base(net), method, request | {"start": nets.feet(net)})
+        fit = fit_everywhere(
+            partial(fit_cloud, cloud, nets.base(net), method), request | {"start": nets.feet(net)}
+        )
     # Duplicates add nothing to the fit, but are on the sheet as well.
     same = (points[sheet.number[sheet.nearest]] == cloud).all(axis=1) & sheet.on_sheet[sheet.nearest]
     counted = finite.copy()

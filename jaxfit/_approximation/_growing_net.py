@@ -1,6 +1,8 @@
 """Fits of clouds whose net grows until the tolerances are met, or until finer nets follow only noise."""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +31,9 @@ ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
 # Nets share a program where each direction has room for the same number of control points: compiling costs
 # more than the surplus ones.
 ROOMS = 24, 50, 96  # beyond, a net has no more than it needs
+# A cloud without outliers is fitted on while one of its points is farther from the surface than so many times
+# the tolerance of the average: that may be met before the fit has come to the ends of a scroll.
+FAR = 10.0
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
@@ -49,8 +54,10 @@ class NetGrowth:
         nets: AbstractNets,
         method: Any,
         request: dict[str, Any],
+        cleaned: bool = False,
     ):
         self.points, self.nets, self.method, self.request = points, nets, method, request
+        self.cleaned = cleaned  # of outliers
         given = request["weights"]
         self.weights = np.ones(len(points)) if given is None else np.asarray(given, float)
         counted = np.flatnonzero(self.weights > 0)
@@ -68,6 +75,11 @@ class NetGrowth:
         return fit_cloud(
             points, base, self.method, request, Room((net[0], net[1]), self.request["max_steps"])
         )
+
+    def whole(self, base: BSplineSurface, request: dict[str, Any]) -> Fit:
+        """The fit of all points."""
+        fit = partial(self.fit, self.points, base)
+        return fit_everywhere(fit, request) if self.cleaned else fit(request)
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
@@ -120,6 +132,20 @@ class NetGrowth:
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
 
 
+def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
+    """The fit to a cleaned cloud. Without a tolerance for the maximum it goes on until that is FAR times the
+    one for the average, if it comes to that; the average alone decides whether it has converged.
+    """
+    average, throw = request["tol_average"], request["throw"]
+    if average is None or request["tol_maximum"] is not None:
+        return fit(request)
+    found = fit(request | {"tol_maximum": FAR * average, "throw": False})
+    ended = found.result in (RESULTS.stalled, RESULTS.max_steps_reached)
+    if ended and float(found.average_error) <= average:
+        found = dataclasses.replace(found, result=RESULTS.converged)
+    return converged_or_raise(found) if throw else found
+
+
 def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     """The fit with a net of the size that the tolerances take, or that the points allow."""
     level, why = growth.grown(base)
@@ -127,14 +153,14 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
     request["start"] = growth.nets.feet(growth.net(size))
-    fit = growth.fit(growth.points, level.fit.surface, request)
+    fit = growth.whole(level.fit.surface, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= GROWTH
         if bool(fit.converged) or size > growth.most:
             break
         net = growth.net(size)
         request["start"] = growth.nets.feet(net)
-        fit = growth.fit(growth.points, growth.nets.carried(fit.surface, net), request)
+        fit = growth.whole(growth.nets.carried(fit.surface, net), request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     return converged_or_raise(fit) if growth.request["throw"] else fit
