@@ -23,7 +23,7 @@ PAGES = {
     "results_and_methods": "_fit",
     "surfaces_and_curves": "_splines _trimmed",
     "closest_points_and_quality": "_closest _quality _normal_equations",
-    "files": "io",
+    "files": "io _program_folder",
     "pictures": "plot",
 }
 PAGE_OF = {room: page for page, rooms in PAGES.items() for room in rooms.split()}

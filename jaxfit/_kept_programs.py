@@ -28,7 +28,7 @@ TRACED_WITH = ("jax", "jaxlib", "numpy", "equinox", "lineax", "optimistix", "jax
 _WORDS = (str, bytes, bool, int, float, complex, type(None), type(Ellipsis))
 
 folder: Path | None = None
-_loaded: dict[str, Any] = {}
+_loaded: dict[Path, Any] = {}
 
 
 class Unspoken(Exception):
@@ -46,20 +46,20 @@ def call_kept(jitted: Any, static: int, args: tuple[Any, ...]) -> Any:
     if folder is None or key is None:
         return jitted(*args)
     path, taken = folder / f"{jitted.__name__}-{key}{SUFFIX}", args[static:]
-    if key not in _loaded and (program := _read(path, taken)) is not None:
+    if path not in _loaded and (program := _read(path, taken)) is not None:
         # What XLA can't link, it finds out only when the program runs.
         with contextlib.suppress(jax.errors.JaxRuntimeError):
             results = jax.block_until_ready(program(*taken))
-            _loaded[key] = program
+            _loaded[path] = program
             return results
-    if key not in _loaded:
-        _loaded[key] = _compiled(path, jitted, args)
-    return _loaded[key](*taken)
+    if path not in _loaded:
+        _loaded[path] = _compiled(path, jitted, args)
+    return _loaded[path](*taken)
 
 
 def _key(name: str, static: tuple[Any, ...], taken: tuple[Any, ...]) -> str | None:
     """What tells one program from every other one, None if that can't be said."""
-    if folder is None or jax.device_count() > 1:
+    if folder is None or jax.device_count() > 1 or jax.config.values["jax_disable_jit"]:
         return None
     try:
         about = (_spelled(static), _spelled(taken, arrays=True))
@@ -97,7 +97,7 @@ def _compiled(path: Path, jitted: Any, args: tuple[Any, ...]) -> Any:
         found, _, tree = serialize_executable.serialize(program)
         # The tree of the results, as results: of those pickle knows the classes.
         results = jax.tree.unflatten(tree, range(tree.num_leaves))
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+        unfinished = path.with_name(f"{path.name}.{os.getpid()}{SUFFIX}")
         try:
             unfinished.write_bytes(zlib.compress(pickle.dumps((found, results)), 1))
             os.replace(unfinished, path)
@@ -126,7 +126,8 @@ def _register_linear_algebra() -> None:
 
 def _settings() -> str:
     """JAX's settings, those of this thread included."""
-    return ",".join(str(getattr(jax.config, x, None)) for x in jax.config.values if "cache" not in x)
+    values = [getattr(jax.config, x, None) for x in jax.config.values if "cache" not in x]
+    return ",".join(map(str, (*values, jax.sharding.get_abstract_mesh())))
 
 
 @functools.cache
@@ -153,6 +154,8 @@ def _machine() -> str:
 def _spelled(value: Any, arrays: bool = False) -> str:
     """`value` in words; of leaves only type, shape and dtype if they are `arrays` that a program takes."""
     if arrays and isinstance(value, (np.ndarray, np.generic, jax.Array, bool, int, float, complex)):
+        if isinstance(value, jax.Array) and (value.devices() != set(jax.devices()) or _has_mesh(value)):
+            raise Unspoken
         kind = jax.typeof(value)
         return f"{kind.dtype}{kind.shape}{kind.weak_type}"
     if isinstance(value, enum.Enum):
@@ -174,6 +177,10 @@ def _spelled(value: Any, arrays: bool = False) -> str:
     if dataclasses.is_dataclass(value):
         return f"{_name(type(value))}({','.join(_fields(value, arrays))})"
     raise Unspoken
+
+
+def _has_mesh(value: jax.Array) -> bool:
+    return not isinstance(value.sharding, jax.sharding.SingleDeviceSharding)
 
 
 def _fields(value: Any, arrays: bool) -> list[str]:

@@ -26,12 +26,12 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
     folder
         Where (default: the environment variable ``JAXFIT_CACHE_DIR``, else ``jaxfit`` in the user's cache
         folder, which is ``~/.cache/jaxfit`` on Linux). It is made if need be. Whoever can write it can run
-        code here.
+        code here. ``"off"`` or an empty name keep nothing.
 
     Returns
     -------
     Path or None
-        The folder; None if the variable is ``off`` or empty, so that nothing is kept.
+        The folder of this version's programs; None if nothing is kept.
 
     Raises
     ------
@@ -43,8 +43,8 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
     Notes
     -----
     No setting of JAX is changed. Its own cache (`jax_compilation_cache_dir`) can be used beside this, for the
-    many small programs around a fit, programs for several devices, and fits with functions of your own, none
-    of which are kept here.
+    many small programs around a fit, programs for several devices, fits with functions of your own, and fits
+    inside `grad`, `vmap` or `jit`, none of which are kept here. What it holds already is not kept here again.
 
     Examples
     --------
@@ -53,7 +53,9 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
     >>> folder = jf.keep_programs(tempfile.mkdtemp())  # doctest: +SKIP
     """
     found = cache_folder(None if folder is None else os.fspath(folder))
-    if found is not None:
+    if found is None:
+        _kept_programs.folder = None
+    else:
         found /= f"{VERSION}{_kept_programs.version_of_code()}"  # so JAX's cache holds nothing that we lack
         found.mkdir(exist_ok=True)
         _kept_programs.folder = found
@@ -66,10 +68,10 @@ def cache_folder(asked: str | None = None) -> Path | None:
     It is the one that is `asked` for, else that of the environment variable, else one in the user's cache
     folder. Raises OSError if it cannot be written.
     """
-    named = asked or os.environ.get(VARIABLE)
+    named = os.environ.get(VARIABLE) if asked is None else asked
     if named is not None and named.strip().lower() in ("", "off"):
         return None
-    folder = Path(named) if named else _user_cache() / "jaxfit"
+    folder = Path(named).expanduser() if named else _user_cache() / "jaxfit"
     # JAX runs what it finds there, so nobody else may write it.
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     trial = folder / f".{os.getpid()}"
@@ -95,8 +97,9 @@ def _remove_oldest(folder: Path) -> None:
     """
     found = []
     for path in folder.glob(f"{VERSION}*/*{_kept_programs.SUFFIX}"):
-        status = path.stat()
-        found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
+        with contextlib.suppress(OSError):  # another process may have removed it
+            status = path.stat()
+            found.append((max(status.st_atime, status.st_mtime), status.st_size, path))
     total = 0
     for _, size, path in sorted(found, reverse=True):
         total += size

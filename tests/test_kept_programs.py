@@ -181,6 +181,47 @@ def test_gradients_are_those_without_kept_programs(kept):
     np.testing.assert_allclose(with_programs, jax.grad(energy)(grid), rtol=1e-9)
 
 
+def test_without_jit_and_with_a_mesh_nothing_is_kept(kept):
+    double = jax.jit(lambda x: 2 * x)
+    double.__qualname__ = "double"
+    with jax.disable_jit():
+        assert _kept_programs.call_kept(double, 0, (1.0,)) == 2.0
+    assert not kept
+    grid = wavy_grid(8, 7)
+    plain = jf.interpolate(grid, jf.StandardInterpolation()).surface.control_points
+    mesh = jax.make_mesh((1,), ("x",))
+    held = jax.device_put(grid, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("x")))
+    found = jf.interpolate(held, jf.StandardInterpolation()).surface.control_points
+    assert kept == ["_compiled"]
+    np.testing.assert_allclose(plain, found, atol=1e-12)
+
+
+def test_off_is_off_and_another_folder_gets_its_own(kept, tmp_path, monkeypatch):
+    folders = [jf.keep_programs(tmp_path / name) for name in "ab" if nearest() is not None]
+    nearest()
+    assert [len(os.listdir(folder)) for folder in folders] == [len(set(kept))] * 2
+    for off in ("off", ""):
+        assert jf.keep_programs(off) is None
+        assert _kept_programs.folder is None
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert jf.keep_programs("~/c").parent == tmp_path / "c"
+
+
+def test_a_file_that_another_process_has_removed_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "version-a").mkdir()
+    (tmp_path / "version-a" / "gone-cache").symlink_to(tmp_path / "nothing")
+    assert _program_folder.cache_folder(str(tmp_path)) == tmp_path
+
+
+def folder_of_programs():
+    return _kept_programs.folder
+
+
+def test_worker_processes_keep_programs_in_the_same_folder(kept, tmp_path):
+    with jf.worker_processes(1) as executor:
+        assert executor.submit(folder_of_programs).result() == tmp_path
+
+
 FITS = """
 import sys
 import jax

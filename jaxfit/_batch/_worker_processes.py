@@ -7,9 +7,11 @@ import os
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import jax
 
+from jaxfit import _kept_programs
 from jaxfit._checks import check_number
 from jaxfit._precision import working_dtype
 
@@ -23,9 +25,9 @@ _HANDED_ON = (
 def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor]:
     """Processes that share the cores of this machine, as an executor for `map_fits`.
 
-    Each starts Python and JAX anew, which takes seconds, and compiles for itself, or reads what is kept in
-    the compilation cache of the session. So they pay for hundreds of fits, and for further calls with the
-    same executor. They have the precision and the compilation cache of the session, and as many threads as
+    Each starts Python and JAX anew, which takes seconds, and compiles for itself, or reads what is kept by
+    `keep_programs` or in JAX's compilation cache. So they pay for hundreds of fits, and for further calls
+    with the same executor. They have the precision and these folders of the session, and as many threads as
     there are cores for each.
 
     Parameters
@@ -80,7 +82,9 @@ def started_processes(workers: int) -> ProcessPoolExecutor:
     try:
         # A fork would inherit the threads of JAX without what they hold.
         spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=_ignore_interrupts)
+        pool = ProcessPoolExecutor(
+            workers, mp_context=spawn, initializer=_begin, initargs=(_kept_programs.folder,)
+        )
         for _ in range(workers):
             pool.submit(working_dtype)  # each starts a process, for none is idle yet
     finally:
@@ -102,5 +106,6 @@ def end_processes(pool: ProcessPoolExecutor, at_once: bool = False) -> None:
     gc.collect()  # of the semaphores, of which the system otherwise warns
 
 
-def _ignore_interrupts() -> None:
+def _begin(programs: Path | None) -> None:
+    _kept_programs.folder = programs
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first ends the others
