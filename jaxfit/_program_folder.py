@@ -104,6 +104,6 @@ def _remove_oldest(folder: Path) -> None:
     for _, size, path in sorted(found, reverse=True):
         total += size
         if total > LARGEST or not size:  # what was interrupted while it was written is empty
-            path.unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # of an older version this was the last
+            with contextlib.suppress(OSError):  # in use elsewhere, or gone; the folder holds others still
+                path.unlink()
                 path.parent.rmdir()
