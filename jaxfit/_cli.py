@@ -96,7 +96,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        print_table({**read_from, **facts(done.fit), **outcome})
+        print_table({**read_from, "tolerances": done.tolerances, **facts(done.fit), **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 

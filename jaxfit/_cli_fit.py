@@ -1,6 +1,7 @@
 """The fit of one file, as the arguments of the command ask for it."""
 
 import argparse
+import inspect
 import math
 import time
 from typing import Any, NamedTuple
@@ -16,7 +17,9 @@ _LARGEST_INTERPOLATION = 40_000  # grid points, for --method auto
 
 
 class FittedFile(NamedTuple):
-    """A fit whose errors are finite, its errors as fractions of the diagonal, and whether these will do."""
+    """A fit whose errors are finite, its errors as fractions of the diagonal, whether these will do, and the
+    tolerances in force.
+    """
 
     fit: Any
     method: str
@@ -24,6 +27,7 @@ class FittedFile(NamedTuple):
     maximum: float
     seconds: float
     reached: bool
+    tolerances: str
 
 
 def read(args: argparse.Namespace) -> io.PointData:
@@ -68,21 +72,31 @@ class FitOfFile:
         if not (math.isfinite(average) and math.isfinite(maximum)):
             raise ArithmeticError(fit.message)
         reached = _reached(self.args, self.method, fit, average, maximum)
-        return FittedFile(fit, self.method, average, maximum, seconds, reached)
+        return FittedFile(fit, self.method, average, maximum, seconds, reached, self._tolerances())
+
+    def _tolerances(self) -> str:
+        """The tolerances in force, in per cent."""
+        asked = self._asked()
+        if interpolates(self.method):  # it bounds the maximum, and with it the average
+            return f"maximum {min(asked.values()):g} %" if asked else "rounding (default)"
+        default = inspect.signature(jaxfit.approximate).parameters["tol_average"].default
+        said = f"{asked['tol_average']:g} %" if "tol_average" in asked else f"{100 * default:g} % (default)"
+        most = asked.get("tol_maximum")
+        return f"average {said}, maximum {'without limit' if most is None else f'{most:g} %'}"
+
+    def _asked(self) -> dict[str, float]:
+        """The tolerances that were given, in per cent."""
+        given = {"tol_average": self.args.tol_average, "tol_maximum": self.args.tol_maximum}
+        return {name: value for name, value in given.items() if value is not None}
 
     def _fit(self, progress: Any) -> Any:
         args, data = self.args, self.data
         options: dict[str, Any] = {"order": args.order, "progress": progress, **self.options}
         if args.max_steps is not None:
             options["max_steps"] = args.max_steps
-        tolerances = {
-            name: value / 100
-            for name, value in (("tol_average", args.tol_average), ("tol_maximum", args.tol_maximum))
-            if value is not None
-        }
+        tolerances = {name: value / 100 for name, value in self._asked().items()}
         if interpolates(self.method) and data.grid is not None:
             if tolerances:
-                # Interpolation bounds the maximum error, and with it the average.
                 options["tolerance"] = min(tolerances.values())
             return jaxfit.interpolate(data.grid, **options)
         if self.boundary is None:

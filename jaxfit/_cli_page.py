@@ -27,16 +27,17 @@ def write_page(
         args.report,
         points=data.cloud if data.grid is None else data.grid,
         title=data.name,
-        tables={"Input": read, "Settings": _settings(args), "Output": written},
+        tables={"Input": read, "Settings": _settings(args, done), "Output": written},
         version=jaxfit.__version__,
     )
 
 
-def _settings(args: argparse.Namespace) -> dict[str, str]:
-    """The options that were given, by the names they have on the command line."""
+def _settings(args: argparse.Namespace, done: FittedFile) -> dict[str, str]:
+    """The tolerances, and the options that were given, by the names they have on the command line."""
     given = {name: getattr(args, name) for name in (*_SETTINGS, *OPTIONS)}
     said = {name: _said(name, value) for name, value in given.items() if value not in (None, False)}
-    return {f"--{name.replace('_', '-')}": value for name, value in said.items()}
+    options = {f"--{name.replace('_', '-')}": value for name, value in said.items()}
+    return {"tolerances": done.tolerances, **options}
 
 
 def _said(name: str, value: Any) -> str:

@@ -345,6 +345,22 @@ def test_the_table_says_all(fits, folder, capsys, monkeypatch, rich):
         assert said in captured.out
 
 
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ("cloud.npz", "average 0.06 % (default), maximum without limit"),
+        ("cloud.npz --tol-maximum 2", "average 0.06 % (default), maximum 2 %"),
+        ("cloud.npz --tol-average 0.01", "average 0.01 %, maximum without limit"),
+        ("grid.npz", "rounding (default)"),
+        ("grid.npz --tol-average 0.01 --tol-maximum 0.1", "maximum 0.01 %"),
+    ],
+)
+def test_the_table_says_the_tolerances_in_force(fits, folder, capsys, argv, said):
+    run(*argv.split())
+    row = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("tolerances"))
+    assert row.removeprefix("tolerances").strip() == said
+
+
 def test_quiet_is_silent(fits, folder, capsys):
     assert run("cloud.npz", "--quiet") == 0
     captured = capsys.readouterr()
