@@ -15,7 +15,7 @@ from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_page import write_page
-from jaxfit._cli_report import print_table, progress_bar
+from jaxfit._cli_report import as_sentence, print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
 from jaxfit._fit._summary import facts
 
@@ -64,7 +64,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _fail(sentence: object, code: int) -> int:
-    print("jaxfit: error:", " ".join(str(sentence).split()), file=sys.stderr)
+    print("jaxfit: error:", as_sentence(sentence), file=sys.stderr)
     return code
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxfit import io
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_methods import OPTIONS as METHOD_OPTIONS
+from jaxfit._cli_report import as_sentence
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row
 from jaxfit._precision import bucket
@@ -79,7 +80,7 @@ def failed(job: Job, sentence: object) -> Row:
     """The row of a job that failed. It has no surface, and one of an earlier run goes."""
     with contextlib.suppress(OSError):
         os.unlink(job.arguments["output"])
-    return job.row | {"status": FAILED, "error": " ".join(str(sentence).split()), "surface": None}
+    return job.row | {"status": FAILED, "error": as_sentence(sentence), "surface": None}
 
 
 def _fitted(args: argparse.Namespace) -> Row:

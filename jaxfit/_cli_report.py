@@ -2,9 +2,19 @@
 
 import contextlib
 import importlib.util
+import re
 from collections.abc import Callable, Iterator, Mapping
 
 Progress = Callable[[int, int, float, float], None]
+
+# Options that sentences of the library name as in Python; not as a part of a file's name.
+_IN_PYTHON = re.compile(r"(?<![\w./\\-])(hole_length|tol_average|tol_maximum|max_steps)(?![\w-]|[./\\]\w)")
+
+
+def as_sentence(error: object) -> str:
+    """What went wrong in one line, its options by the names they have on the command line."""
+    line = " ".join(str(error).split())
+    return _IN_PYTHON.sub(lambda found: "--" + found[1].replace("_", "-"), line)
 
 
 def print_table(rows: Mapping[str, str]) -> None:

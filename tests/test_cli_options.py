@@ -361,6 +361,13 @@ def test_the_table_says_the_tolerances_in_force(fits, folder, capsys, argv, said
     assert row.removeprefix("tolerances").strip() == said
 
 
+def test_sentences_name_options_as_on_the_command_line(fits, folder, capsys):
+    fits.fails = ValueError("raise hole_length, or\n tol_average; see hole_length.csv and ./max_steps.")
+    assert run("bare.xyz") == 2
+    said = "raise --hole-length, or --tol-average; see hole_length.csv and ./max_steps."
+    assert capsys.readouterr().err == f"jaxfit: error: {said}\n"
+
+
 def test_quiet_is_silent(fits, folder, capsys):
     assert run("cloud.npz", "--quiet") == 0
     captured = capsys.readouterr()
