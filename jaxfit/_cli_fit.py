@@ -71,14 +71,21 @@ class FitOfFile:
         seconds = time.perf_counter() - before
         if not (math.isfinite(average) and math.isfinite(maximum)):
             raise ArithmeticError(fit.message)
-        reached = _reached(self.args, self.method, fit, average, maximum)
+        reached = self._reached(fit, average, maximum)
         return FittedFile(fit, self.method, average, maximum, seconds, reached, self._tolerances())
+
+    def _reached(self, fit: Any, average: float, maximum: float) -> bool:
+        """Whether the errors will do. Without a requested tolerance every finite fit of a cloud does."""
+        asked, errors = self._asked(), {"tol_average": average, "tol_maximum": maximum}
+        if interpolates(self.method) and not asked:
+            return bool(fit.converged)
+        return all(errors[name] <= value / 100 for name, value in asked.items())
 
     def _tolerances(self) -> str:
         """The tolerances in force, in per cent."""
         asked = self._asked()
         if interpolates(self.method):  # it bounds the maximum, and with it the average
-            return f"maximum {min(asked.values()):g} %" if asked else "rounding (default)"
+            return f"maximum {min(asked.values()):g} %" if asked else "maximum at rounding (default)"
         default = inspect.signature(jaxfit.approximate).parameters["tol_average"].default
         said = f"{asked['tol_average']:g} %" if "tol_average" in asked else f"{100 * default:g} % (default)"
         most = asked.get("tol_maximum")
@@ -132,13 +139,3 @@ def _choose_boundary(args: argparse.Namespace, data: io.PointData) -> Any:
     if data.grid is not None:
         return jaxfit.Boundary.from_grid(data.grid)  # says what is wrong with its edges
     return None  # the rim of the points is found by the fit
-
-
-def _reached(args: argparse.Namespace, method: str, fit: Any, average: float, maximum: float) -> bool:
-    if interpolates(method) and args.tol_average is None and args.tol_maximum is None:
-        return bool(fit.converged)
-    # Without a requested tolerance every finite fit will do.
-    return all(
-        tolerance is None or error <= tolerance / 100
-        for error, tolerance in ((average, args.tol_average), (maximum, args.tol_maximum))
-    )

@@ -351,7 +351,7 @@ def test_the_table_says_all(fits, folder, capsys, monkeypatch, rich):
         ("cloud.npz", "average 0.06 % (default), maximum without limit"),
         ("cloud.npz --tol-maximum 2", "average 0.06 % (default), maximum 2 %"),
         ("cloud.npz --tol-average 0.01", "average 0.01 %, maximum without limit"),
-        ("grid.npz", "rounding (default)"),
+        ("grid.npz", "maximum at rounding (default)"),
         ("grid.npz --tol-average 0.01 --tol-maximum 0.1", "maximum 0.01 %"),
     ],
 )
