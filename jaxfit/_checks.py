@@ -27,6 +27,18 @@ def is_concrete(*trees: Any) -> bool:
     return True
 
 
+def without_derivatives(tree: Any) -> Any:
+    """The tree with `stop_gradient` of its tracers; the rest is left as it is."""
+
+    def value(x: Any) -> Any:
+        if not isinstance(x, jax.core.Tracer):
+            return x
+        x = jax.lax.stop_gradient(x)
+        return x if isinstance(x, jax.core.Tracer) else jax.device_put(np.asarray(x))
+
+    return jax.tree.map(value, tree)
+
+
 def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
     """Have `function` computed at once, even while something around it is traced, if none of its arguments
     is: inside `jit` JAX would otherwise trace what depends on constants only.

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.typing import ArrayLike
 
 from jaxfit._approximation._checked_arguments import checked_request
@@ -18,7 +17,7 @@ from jaxfit._approximation._implicit_fit import (
     polished_fitted,
     with_implicit_derivative,
 )
-from jaxfit._checks import as_points, check_kind, is_concrete
+from jaxfit._checks import as_points, check_kind, is_concrete, without_derivatives
 from jaxfit._closest import closest_point
 from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._history import public_history
@@ -104,18 +103,6 @@ def fit_cloud(
     }
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
-
-
-def without_derivatives(tree: Any) -> Any:
-    """The tree with `stop_gradient` of its tracers; the rest is left as it is."""
-
-    def value(x: Any) -> Any:
-        if not isinstance(x, jax.core.Tracer):
-            return x
-        x = lax.stop_gradient(x)
-        return x if isinstance(x, jax.core.Tracer) else jax.device_put(np.asarray(x))
-
-    return jax.tree.map(value, tree)
 
 
 def _differentiable(

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._checked_scan import checked_scan
-from jaxfit._approximation._cloud_fit import LEAST_POINTS, without_derivatives
+from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import FIRST_SIZE, NetGrowth, fit_growing
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
@@ -23,7 +23,14 @@ from jaxfit._base import (
     default_base,
     default_net,
 )
-from jaxfit._checks import as_points, check_kind, check_order, eager_where_concrete, is_concrete
+from jaxfit._checks import (
+    as_points,
+    check_kind,
+    check_order,
+    eager_where_concrete,
+    is_concrete,
+    without_derivatives,
+)
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
 from jaxfit._progress_line import doing, shows_progress

@@ -1,6 +1,7 @@
 """The closest point on a curve or surface, for many points at once."""
 
 import enum
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,10 +19,12 @@ from jaxfit._checks import (
     check_number,
     eager_where_concrete,
     is_concrete,
+    without_derivatives,
 )
 from jaxfit._closest._foot_methods import AbstractFootMethod, Newton
-from jaxfit._closest._implicit import foot_parameters
+from jaxfit._closest._implicit import Arrays, as_feet, searched_feet
 from jaxfit._closest._nearest_feet import nearest_feet
+from jaxfit._compile import compiled
 from jaxfit._precision import advise_x64, default_foot_tolerance
 from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineCurve, BSplineSurface
@@ -138,8 +141,8 @@ def closest_point(
     with a jump (a knot as often as its order) the value at the knot is that from the right; a query nearest
     to the left one is reported as not converged.
 
-    Works under `jit`, `vmap` and `grad`. Inside a transformation the global search is by brute force from
-    two starts per point, which is slower and may, where three or more feet compete, miss the nearest. The
+    Works under `jit`, `vmap` and `grad`. Inside `jit` and `vmap` the global search is by brute force from two
+    starts per point, which is slower and may, where three or more feet compete, miss the nearest. The
     derivative is implicit: $d(u, v) = H^{-1} dg$ with $g$ the orthogonality equations and $H$ the Hessian of
     half the squared distance; a coordinate held at a border does not move, and where $H$ is singular
     (centres of curvature) the derivative is set to zero.
@@ -170,10 +173,16 @@ def closest_point(
         tolerance = default_foot_tolerance(net.dtype)
     elif is_concrete(tolerance):
         advise_x64(float(tolerance), net.dtype)
-    if is_concrete(net, knots_u, knots_v, queries, starts, tolerance, max_steps):
-        result = _on_host(method, (net, knots_u, knots_v), queries, starts, tolerance, max_steps)
+    given = (net, knots_u, knots_v), queries, starts, tolerance, max_steps
+    values = without_derivatives(given)
+    if is_concrete(given):
+        result = _on_host(method, *given)
     else:
-        result = _traced(method, (net, knots_u, knots_v), queries, starts, tolerance, max_steps)
+        queries = jnp.asarray(queries, net.dtype) if is_concrete(queries) else queries
+        if is_concrete(values):  # under `grad` alone
+            result = _followed(_on_host(method, *values), given[0], queries, tolerance)
+        else:
+            result = _traced(method, given[0], queries, *given[2:])
     if isinstance(surface, BSplineCurve):
         result = eqx.tree_at(lambda x: x.v, result, None)
     return result
@@ -208,7 +217,7 @@ def _status(breaks_u: Any, breaks_v: Any, u: Any, v: Any, converged: Any, curve:
 
 def _on_host(
     method: AbstractFootMethod,
-    arrays: tuple[Array, Array, Array],
+    arrays: Arrays,
     points: Any,
     start: tuple[Any, Any] | None,
     tolerance: float,
@@ -228,27 +237,45 @@ def _on_host(
     return ClosestPoint(*jax.device_put((u, v, best["point"], distance, converged, status, best["steps"])))
 
 
+@partial(compiled, static_argnums=0)
 def _traced(
     method: AbstractFootMethod,
-    arrays: tuple[Array, Array, Array],
+    arrays: Arrays,
     points: Any,
     start: tuple[Any, Any] | None,
     tolerance: Any,
     max_steps: Any,
 ) -> ClosestPoint:
     """Queries inside a transformation: one computation, differentiable."""
-    net, knots_u, knots_v = arrays
-    points = jnp.asarray(points, net.dtype) if is_concrete(points) else points
-    dtype = jnp.result_type(net, points)
-    points = points.astype(dtype)
-    corners = lax.stop_gradient(jnp.concatenate([net.reshape(-1, net.shape[-1]), points]))
-    size = jnp.linalg.norm(jnp.max(corners, axis=0) - jnp.min(corners, axis=0))
+    dtype = jnp.result_type(arrays[0], points)
+    arrays, points = (arrays[0].astype(dtype), *arrays[1:]), points.astype(dtype)
     if start is not None:
         start = (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype))
-    limits = (jnp.asarray(tolerance, dtype) * size, jnp.asarray(max_steps, jnp.int32))
-    limits = lax.stop_gradient(limits)
-    surface = (net.astype(dtype), knots_u, knots_v)
-    u, v, converged, steps = foot_parameters(method, surface, points, start, *limits)
+    limits = _length(arrays[0], points, tolerance), jnp.asarray(max_steps, jnp.int32)
+    u, v, converged, steps = searched_feet(method, arrays, points, start, *limits)
+    return _at_feet((u, v), converged, steps, arrays, points, limits[0])
+
+
+@compiled
+def _followed(found: ClosestPoint, arrays: Arrays, points: Any, tolerance: Any) -> ClosestPoint:
+    """`found` as a function of surface and points."""
+    limit = _length(arrays[0], points, tolerance)
+    return _at_feet((found.u, found.v), found.converged, found.steps, arrays, points, limit)
+
+
+def _length(net: Array, points: Array, tolerance: Any) -> Array:
+    """The tolerance as a length."""
+    corners = lax.stop_gradient(jnp.concatenate([net.reshape(-1, net.shape[-1]), points]))
+    size = jnp.linalg.norm(jnp.max(corners, axis=0) - jnp.min(corners, axis=0))
+    return lax.stop_gradient(jnp.asarray(tolerance, size.dtype) * size)
+
+
+def _at_feet(
+    feet: Any, converged: Array, steps: Array, arrays: Arrays, points: Array, tolerance: Array
+) -> ClosestPoint:
+    """What there is at known feet, which follow surface and points."""
+    net, knots_u, knots_v = arrays
+    u, v = as_feet(feet, arrays, points, tolerance)
     (point,) = evaluate_surface(net, knots_u, knots_v, u, v, ((0, 0),), False)
     square = jnp.sum((points - point) ** 2, axis=-1)
     apart = square > 0

@@ -23,7 +23,7 @@ from jaxfit._splines._pieces import make_pieces
 Arrays = tuple[Array, Array, Array]  # control points and both knot vectors
 
 
-def foot_parameters(
+def searched_feet(
     method: AbstractFootMethod,
     surface: Arrays,
     points: Float[Array, "points d"],
@@ -31,16 +31,17 @@ def foot_parameters(
     tolerance: Array,
     max_steps: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """(u, v, converged, steps); from `start`, or from the two best of a dense sample without one."""
+    """(u, v, converged, steps); from `start`, or from the two best of a dense sample without one.
+
+    They are constants to a derivative; `as_feet` makes them follow surface and points.
+    """
     fixed = lax.stop_gradient((surface, points, start, tolerance, max_steps))
     search = partial(_found, method)
     if (
         jax.default_backend() == "cpu"
     ):  # a batch one by one: an ordinary vmap would compute both branches of every condition
         search = jax.custom_batching.sequential_vmap(search)
-    u, v, converged, steps = search(*fixed)
-    u, v = as_feet((u, v), surface, points, tolerance)
-    return u, v, converged, steps
+    return search(*fixed)
 
 
 def _found(

@@ -83,8 +83,8 @@ class ImplicitAdjoint(AbstractAdjoint):
         Polishing ends at this relative residual of G, or at rounding (default 1e-12; in single precision
         times the ratio of the rounding units).
     polish_steps : int
-        The largest number of Newton steps (default 30). Where they are rejected they are damped. 0 leaves the
-        surface as it is. Approximation only.
+        The largest number of Newton steps (default 100; most fits need less than 20). Where they are rejected
+        they are damped. 0 leaves the surface as it is. Approximation only.
 
     Raises
     ------
@@ -101,11 +101,11 @@ class ImplicitAdjoint(AbstractAdjoint):
     >>> import jaxfit as jf
     >>> adjoint = jf.ImplicitAdjoint()
     >>> adjoint.residual, adjoint.polish_steps
-    (1e-12, 30)
+    (1e-12, 100)
     """
 
     residual: float = 1e-12
-    polish_steps: int = 30
+    polish_steps: int = 100
 
     def __check_init__(self) -> None:
         check_number("residual", self.residual, 0.0)

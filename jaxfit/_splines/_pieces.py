@@ -12,6 +12,7 @@ same with a single cell and order 1 in v.
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
@@ -191,12 +192,18 @@ def span_polynomials(knots: Any, centre: Any, half: Any, order: int) -> Float[Nu
             for each in left[::-1]:
                 basis = _raised_polynomials(basis, each, right)
         else:
-
-            def step(basis: Any, left: Any) -> tuple[Any, None]:
-                return _raised_polynomials(basis, left, right), None
-
-            basis = lax.scan(step, as_varying(jnp.asarray(basis), left), left, reverse=True)[0]
+            basis = _all_raised(jnp.asarray(basis), left, right)
     return basis.transpose(2, 0, 1)
+
+
+@jax.jit  # else a batch would compile the loop anew each time
+def _all_raised(basis: Any, left: Any, right: Any) -> Any:
+    """The polynomials of the highest degree, from those of degree 0."""
+
+    def step(basis: Any, left: Any) -> tuple[Any, None]:
+        return _raised_polynomials(basis, left, right), None
+
+    return lax.scan(step, as_varying(basis, left), left, reverse=True)[0]
 
 
 def _raised_polynomials(basis: Any, left: Any, right: Any) -> Any:
