@@ -21,7 +21,7 @@ from jaxfit._normal_equations import (
     gmres,
 )
 
-RESTART, MOST_CYCLES = 40, 25  # of GMRES
+RESTART, MOST_CYCLES = 120, 8  # of GMRES: a restart forgets, and doubles the number of products
 WORST = 1e-4  # the residual that a derivative may leave
 # The share of the rows at fixed parameters in the preconditioner: what curvature adds along the surface.
 DAMPING = 1e-3
@@ -38,7 +38,7 @@ class NewtonSystem(eqx.Module):
     free: Bool[Array, "nu nv"]
 
     def solved(
-        self, apply: Operator, right: Array, shift: Any, rtol: float, most_cycles: int
+        self, apply: Operator, right: Array, shift: Any, rtol: Any, most_cycles: int
     ) -> Float[Array, "nu nv d"]:
         """x with (A + shift fixed) x = right, for A or its transpose."""
         free = self.free[:, :, None]

@@ -23,7 +23,9 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
 
-ACCURACY, MOST_CYCLES = 1e-3, 3  # of the linear systems of the steps
+# Accuracy of the linear systems of the steps: the least, which costs fewest products over all steps, and the
+# most where the next step is to be the last.
+ACCURACY, LAST_ACCURACY, MOST_CYCLES = 1e-2, 0.1, 1
 REACH = 0.6  # of the distance between control points: the longest move in a step
 # The ratio of the actual to the predicted work: above GOOD the shift falls, below POOR it rises.
 GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.3, 4.0
@@ -102,9 +104,9 @@ def polished(
 
         def step() -> tuple[Array, Array]:
             system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
-            move = _shortened(
-                surface.moved_to(now.trial), system.solved(apply, -value, shift, ACCURACY, MOST_CYCLES)
-            )
+            wanted = jnp.clip(LAST_ACCURACY * least / new.size, ACCURACY, LAST_ACCURACY)
+            solution = system.solved(apply, -value, shift, wanted, MOST_CYCLES)
+            move = _shortened(surface.moved_to(now.trial), solution)
             return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
 
         done = good & ((new.size <= least) | (now.steps >= most))

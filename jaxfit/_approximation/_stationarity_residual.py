@@ -13,7 +13,17 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._cells import Rows, cells_to_net, evaluate_jet, row_coefficients, row_moments, row_width, rows_of
+from jaxfit._cells import (
+    Jet,
+    Rows,
+    cells_to_net,
+    evaluate_jet,
+    powers,
+    row_coefficients,
+    row_moments,
+    row_width,
+    rows_of,
+)
 from jaxfit._cells import local_coordinates as local_coordinates_of
 from jaxfit._closest import dot
 from jaxfit._closest._implicit import foot_change
@@ -87,7 +97,8 @@ def stationarity_residual(
     d, shape = problem.target.shape[0], feet.s.shape
     target, (order_u, order_v) = here.target.reshape(d, *shape), pieces.order
     s, t = jax.lax.stop_gradient((feet.s, feet.t))
-    jet = evaluate_jet(row_coefficients(pieces, feet.rows), s, t)
+    monomials = _monomials(s, t, order_u, order_v)
+    jet = _following(row_coefficients(pieces, feet.rows), s, t, monomials)
     if method.finds_feet:
         ds, dt = _foot_moves(pieces, feet, target, jet, problem)
     else:
@@ -98,11 +109,10 @@ def stationarity_residual(
     condition = method.stationarity(here, surface, state, error.reshape(-1))
     weight = condition.weight.reshape(shape)
     pulls = weight[None] * residual
-    moments = row_moments(s, t, pulls, order_u, order_v)
     fixed = jax.lax.stop_gradient(pulls)
-    moments += _raised_u(row_moments(s, t, fixed * ds[None], order_u - 1, order_v))
-    moments += _raised_v(row_moments(s, t, fixed * dt[None], order_u, order_v - 1), order_v - 1)
-    data = _on_net(pieces, feet.rows, moments)
+    moved = jnp.concatenate([pulls, fixed * ds[None], fixed * dt[None]], axis=2)
+    moments = jnp.stack([_sums(x, monomials) for x in moved], axis=2)
+    data = _on_net(pieces, feet.rows, moments.reshape(-1, order_u, order_v * d))
     smooth = _half_gradient(condition, surface.control_points)
     inside = free[:, :, None]
     value = jnp.where(inside, data + smooth, surface.control_points - still)
@@ -113,6 +123,44 @@ def stationarity_residual(
     u = jax.lax.stop_gradient(feet.u) + half_u[cell_u][:, None] * ds
     v = jax.lax.stop_gradient(feet.v) + half_v[cell_v][:, None] * dt
     return StationarityResidual(value, terms, rounding, u, v, error)
+
+
+def _monomials(s: Array, t: Array, order_u: int, order_v: int) -> Float[Array, "rows _ _"]:
+    """s^a t^b at each point of a row, then their derivatives in s, then in t: (a, b) by 3 times the width.
+
+    With this matrix evaluation and sums over points are products that are as quick transposed.
+    """
+    powers_s, powers_t = (_powers_and_slopes(x, order) for x, order in ((s, order_u), (t, order_v)))
+    pairs = (powers_s[0], powers_t[0]), (powers_s[1], powers_t[0]), (powers_s[0], powers_t[1])
+    parts = [(x[:, :, None] * y[:, None]).reshape(len(s), -1, s.shape[1]) for x, y in pairs]
+    return jnp.concatenate(parts, axis=2)
+
+
+def _powers_and_slopes(s: Float[Array, "rows width"], order: int) -> tuple[Array, Array]:
+    """The powers of s below `order`, and their derivatives, (rows, order, width) each."""
+    rising = jnp.moveaxis(powers(s, order), 0, 1)
+    degree = jnp.arange(1, order, dtype=s.dtype)[None, :, None]
+    return rising, jnp.pad(degree * rising[:, :-1], ((0, 0), (1, 0), (0, 0)))
+
+
+def _times(x: Array, monomials: Array) -> Array:
+    return jnp.einsum("rp,rpw->rw", x, monomials, precision=jax.lax.Precision.HIGHEST)
+
+
+def _sums(x: Array, monomials: Array) -> Array:
+    return jnp.einsum("rw,rpw->rp", x, monomials, precision=jax.lax.Precision.HIGHEST)
+
+
+def _following(coefficients: Float[Array, "rows d K L"], s: Array, t: Array, monomials: Array) -> Jet:
+    """The jet at known places; value and first derivatives follow the coefficients."""
+    rows, d = coefficients.shape[:2]
+    fixed = jax.lax.stop_gradient(coefficients)
+    jet = evaluate_jet(fixed, s, t)
+    change = (coefficients - fixed).reshape(rows, d, -1)
+    # A product for each coordinate: one for all, transposed, takes several times as long.
+    changes = jnp.stack([_times(change[:, k], monomials) for k in range(d)])
+    firsts = zip((jet.value, jet.s, jet.t), jnp.split(changes, 3, axis=2), strict=True)
+    return jet._replace(**dict(zip(("value", "s", "t"), (x + dx for x, dx in firsts), strict=True)))
 
 
 def _half_gradient(condition: Stationarity, net: Array) -> Array:
@@ -173,18 +221,3 @@ def _length(x: Float[Array, "d rows width"]) -> Float[Array, "rows width"]:
     square = dot(x, x)
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
-
-
-def _raised_u(moments: Float[Array, "rows k m"]) -> Float[Array, "rows K m"]:
-    """From sums over s^a t^b x those over the derivatives of the powers of s."""
-    power = jnp.arange(1, moments.shape[1] + 1, dtype=moments.dtype)
-    return jnp.pad(power[None, :, None] * moments, ((0, 0), (1, 0), (0, 0)))
-
-
-def _raised_v(moments: Float[Array, "rows K m"], lower: int) -> Float[Array, "rows K M"]:
-    """Likewise for the powers of t, of which there are `lower`."""
-    rows, order_u, _ = moments.shape
-    x = moments.reshape(rows, order_u, lower, -1)
-    power = jnp.arange(1, lower + 1, dtype=moments.dtype)
-    raised = jnp.pad(power[None, None, :, None] * x, ((0, 0), (0, 0), (1, 0), (0, 0)))
-    return raised.reshape(rows, order_u, -1)

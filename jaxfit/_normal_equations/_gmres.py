@@ -25,7 +25,7 @@ def gmres(
     precondition: Operator,
     right: Float[Array, "n m d"],
     restart: int,
-    rtol: float,
+    rtol: Any,
     most_cycles: int,
 ) -> GmresSolution:
     """Solves a regular system, symmetric or not, from 0.
