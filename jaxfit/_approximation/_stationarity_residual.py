@@ -110,8 +110,8 @@ def stationarity_residual(
     weight = condition.weight.reshape(shape)
     pulls = weight[None] * residual
     fixed = jax.lax.stop_gradient(pulls)
-    moved = jnp.concatenate([pulls, fixed * ds[None], fixed * dt[None]], axis=2)
-    moments = jnp.stack([_sums(x, monomials) for x in moved], axis=2)
+    summands = jnp.concatenate([pulls, fixed * ds[None], fixed * dt[None]], axis=2)
+    moments = jnp.stack([_summed(x, monomials) for x in summands], axis=2)
     data = _on_net(pieces, feet.rows, moments.reshape(-1, order_u, order_v * d))
     smooth = _half_gradient(condition, surface.control_points)
     inside = free[:, :, None]
@@ -143,11 +143,13 @@ def _powers_and_slopes(s: Float[Array, "rows width"], order: int) -> tuple[Array
     return rising, jnp.pad(degree * rising[:, :-1], ((0, 0), (1, 0), (0, 0)))
 
 
-def _times(x: Array, monomials: Array) -> Array:
+def _evaluated(x: Float[Array, "rows p"], monomials: Array) -> Float[Array, "rows _"]:
+    """Polynomials with the coefficients x, and their derivatives, at the points of each row."""
     return jnp.einsum("rp,rpw->rw", x, monomials, precision=jax.lax.Precision.HIGHEST)
 
 
-def _sums(x: Array, monomials: Array) -> Array:
+def _summed(x: Float[Array, "rows _"], monomials: Array) -> Float[Array, "rows p"]:
+    """The transpose: sums over each row of the monomials times x."""
     return jnp.einsum("rw,rpw->rp", x, monomials, precision=jax.lax.Precision.HIGHEST)
 
 
@@ -158,7 +160,7 @@ def _following(coefficients: Float[Array, "rows d K L"], s: Array, t: Array, mon
     jet = evaluate_jet(fixed, s, t)
     change = (coefficients - fixed).reshape(rows, d, -1)
     # A product for each coordinate: one for all, transposed, takes several times as long.
-    changes = jnp.stack([_times(change[:, k], monomials) for k in range(d)])
+    changes = jnp.stack([_evaluated(change[:, k], monomials) for k in range(d)])
     firsts = zip((jet.value, jet.s, jet.t), jnp.split(changes, 3, axis=2), strict=True)
     return jet._replace(**dict(zip(("value", "s", "t"), (x + dx for x, dx in firsts), strict=True)))
 
