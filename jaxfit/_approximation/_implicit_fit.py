@@ -15,7 +15,6 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._approximation._newton_system import newton_system
 from jaxfit._approximation._polish import PolishedFit, polished
 from jaxfit._approximation._stationarity_residual import (
     StationarityResidual,
@@ -138,9 +137,8 @@ def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs)
     at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
     here = at_rest.projection
     surface = end.surface.moved_to(at_rest.net)
-    fixed = lax.stop_gradient(inputs)
-    method = eqx.combine(fixed.numbers, rest)
-    system = newton_system(method, end.state, surface, end.problem, (here.u, here.v), here.error)
+    # The system of the last step of polishing was made at a surface so near that it serves here, too.
+    system = at_rest.system
 
     def residual(net: Array) -> StationarityResidual:
         method = eqx.combine(inputs.numbers, rest)
@@ -148,7 +146,7 @@ def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs)
         u, v = (here.u, here.v) if method.finds_feet else _given_feet(end, inputs)
         feet = feet_in_rows(surface, end.problem, u, v)
         args = (method, end.state, end.surface.moved_to(net), problem, feet)
-        return stationarity_residual(*args, at_rest.free, still)
+        return stationarity_residual(*args, system.free, still)
 
     accuracy = float(jnp.finfo(at_rest.net.dtype).eps) ** ACCURACY
     net = lax.custom_root(
@@ -176,7 +174,7 @@ def _outward(
     kept = _base_net(end, inputs) * unit.scale + unit.centre[None, None]
     if inputs.control_points.shape == net.shape:
         kept = inputs.control_points.astype(net.dtype)  # to the last bit
-    net = jnp.where(at_rest.free[:, :, None], moved, kept)
+    net = jnp.where(at_rest.system.free[:, :, None], moved, kept)
     error = by_point(found.error) * unit.scale
     diagonal = _problem(end, inputs).diagonal * unit.scale
     return Fitted(net, by_point(found.u), by_point(found.v), error, diagonal, at_rest.stationarity)

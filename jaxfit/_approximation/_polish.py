@@ -9,7 +9,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._damping import longest_moves
-from jaxfit._approximation._newton_system import newton_system
+from jaxfit._approximation._newton_system import NewtonSystem, newton_system
 from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
     stationarity_residual,
@@ -34,14 +34,11 @@ GROWTH = 4.0  # of |G| in an accepted step
 
 
 class PolishedFit(eqx.Module):
-    """The surface at rest, its feet, and |G| over the norms of its terms.
-
-    `free` are the control points that G determines.
-    """
+    """The surface at rest, its feet, |G| over the norms of its terms, and the system of the last step."""
 
     net: Float[Array, "nu nv d"]
     projection: Projection
-    free: Bool[Array, "nu nv"]
+    system: NewtonSystem
     stationarity: Float[Array, ""]
 
 
@@ -59,6 +56,7 @@ class _State(eqx.Module):
 
     accepted: _Accepted
     trial: Float[Array, "nu nv d"]
+    system: NewtonSystem  # that `trial` comes from
     predicted: Float[Array, ""]
     shift: Float[Array, ""]
     steps: Int[Array, ""]
@@ -84,7 +82,8 @@ def polished(
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
     feet = projection.u, projection.v
-    free = newton_system(method, state, surface, problem, feet, projection.error).free
+    first_system = newton_system(method, state, surface, problem, feet, projection.error)
+    free = first_system.free
 
     def advance(now: _State) -> _State:
         old, there = now.accepted, surface.moved_to(now.trial)
@@ -102,26 +101,28 @@ def polished(
         good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
         shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
 
-        def step() -> tuple[Array, Array]:
+        def step() -> tuple[Array, NewtonSystem, Array]:
             system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
             wanted = jnp.clip(LAST_ACCURACY * least / new.size, ACCURACY, LAST_ACCURACY)
             solution = system.solved(apply, -value, shift, wanted, MOST_CYCLES)
             move = _shortened(surface.moved_to(now.trial), solution)
-            return now.trial + move, jnp.sum(move * (value + 0.5 * apply(move)))
+            return now.trial + move, system, jnp.sum(move * (value + 0.5 * apply(move)))
 
         done = good & ((new.size <= least) | (now.steps >= most))
-        none = (old.net, jnp.zeros_like(work))
-        trial, predicted = lax.cond(good & ~done, step, lambda: none)
+        none = (old.net, now.system, jnp.zeros_like(work))
+        trial, system, predicted = lax.cond(good & ~done, step, lambda: none)
         accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
-        return _State(accepted, trial, predicted, shift, now.steps + good, ~good, done | (shift > MOST_SHIFT))
+        ended = done | (shift > MOST_SHIFT)
+        return _State(accepted, trial, system, predicted, shift, now.steps + good, ~good, ended)
 
     nothing = jnp.zeros((), still.dtype)
     first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
     yes = jnp.asarray(True)
-    begin = _State(first, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes)
-    end = lax.while_loop(lambda now: ~now.done, advance, begin).accepted
+    begin = _State(first, still, first_system, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes)
+    last = lax.while_loop(lambda now: ~now.done, advance, begin)
+    end = last.accepted
     share = end.size / jnp.where(end.terms > 0, end.terms, 1.0)
-    return PolishedFit(end.net, end.projection, free, share)
+    return PolishedFit(end.net, end.projection, last.system, share)
 
 
 def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:
