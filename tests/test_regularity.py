@@ -148,9 +148,18 @@ def test_large_nets_are_sampled_in_every_span():
     net = sheet(lambda u: u, n=303)[:, :5]
     net[150:152, :, 0] = net[151:149:-1, :, 0]
     found = jf.regularity(spline(net))
-    assert found.samples == (600, 200)
+    assert found.samples == (1500, 200)
     assert found.folds > 0
     assert jf.regularity(spline(net), samples=20).folds == 0
+
+
+def test_sharp_crests_of_a_fine_net_are_no_folds():
+    """A terrain, so that no normal points downward; its crests turn by 117 degrees within half a span."""
+    span = np.arange(103)
+    x, y = np.meshgrid(span, [0.0, 50.0, 100.0, 150.0], indexing="ij")
+    terrain = spline(np.stack([x, y, 4.0 * (x % 8 == 0)], axis=2))
+    assert jf.regularity(terrain).folds == 0
+    assert jf.regularity(terrain, samples=200).folds > 0
 
 
 def test_measuring_compiles_nothing_and_takes_milliseconds():

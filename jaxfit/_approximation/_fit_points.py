@@ -113,10 +113,10 @@ def fit_points(
     each way, again and again, each fit starting from the one before. That ends where the tolerances are met.
     It also ends where the tenth of the points that was held out comes no nearer to the surface, by 2 % of its
     average error, as the net gets finer: what is left is noise, and the net before is taken. And it ends
-    with three points for a control point, or with 200 of these each way, without a boundary 96. The last fit
-    is one to all points. Each net takes at most 20 iterations, the last up to `max_steps` where the
-    tolerances can be met. Of more than 20,000 points as many as the net needs, 48 for a control point, choose
-    it.
+    with two points for a control point, without a boundary three; or with 200 control points each way,
+    without a boundary 96. The last fit is one to all points. Each net takes at most 20 iterations, the
+    last up to `max_steps` where the tolerances can be met. Of more than 20,000 points as many as the net
+    needs, 48 for a control point, choose it.
 
     Without a boundary each point has its Delaunay star in its own tangent plane, and triangles on which
     stars agree make the mesh. It is laid out flat with little distortion and no flipped triangle (symmetric

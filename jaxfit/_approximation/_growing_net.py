@@ -24,7 +24,6 @@ BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that w
 LEVEL_STEPS = 20  # iterations with each net but the last
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
-POINTS_A_CONTROL_POINT = 3  # at least, of any net
 # A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
 # POINTS_TO_CHOOSE for each control point.
 ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
@@ -63,7 +62,7 @@ class NetGrowth:
         counted = np.flatnonzero(self.weights > 0)
         # Sorted, so that every n-th of them is an even choice, whatever order the points came in.
         self.sorted = counted[np.lexsort(points[counted].T)]
-        self.most = float(np.sqrt(len(counted) / POINTS_A_CONTROL_POINT))
+        self.most = float(np.sqrt(len(counted) / nets.points_a_control_point))
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""

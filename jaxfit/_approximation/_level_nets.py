@@ -2,6 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +17,12 @@ Feet = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
 
 class AbstractNets(ABC):
-    """Nets of every size, and a surface taken from one to another."""
+    """Nets of every size, and a surface taken from one to another.
+
+    `points_a_control_point` is the least number of points for each control point of any net.
+    """
+
+    points_a_control_point: ClassVar[float]
 
     @abstractmethod
     def net(self, size: float, most: int) -> tuple[int, int]:
@@ -35,6 +41,7 @@ class AbstractNets(ABC):
 class BoundaryNets(AbstractNets):
     """The sides are those of the boundary with every net."""
 
+    points_a_control_point = 2.0
     boundary: Boundary
     order: tuple[int, int]
 
@@ -54,6 +61,7 @@ class BoundaryNets(AbstractNets):
 class SheetNets(AbstractNets):
     """Surfaces beyond the sheet on all sides, each at parameters made for it."""
 
+    points_a_control_point = 3.0  # some of these are where no points are
     sheet: Sheet
     order: tuple[int, int]
 

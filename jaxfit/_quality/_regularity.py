@@ -11,7 +11,7 @@ from jaxfit._quality._host_derivatives import HostDerivatives, UnitSurface
 from jaxfit._splines import BSplineSurface
 
 SAMPLES = 200  # along each direction, and
-SAMPLES_A_SPAN = 2  # at least, so that large nets do not fold between them
+SAMPLES_A_SPAN = 5  # at least: with fewer, sharp bends of fine nets count as folds, and some folds do not
 
 
 class Regularity(eqx.Module):
@@ -98,8 +98,8 @@ def regularity(surface: BSplineSurface, samples: int | None = None) -> Regularit
     surface : BSplineSurface
         In any dimension.
     samples : int, optional
-        Samples along each direction, at least 2. Default: 200, or two for each knot span in a direction that
-        has more than 100 of them. Folds narrower than the distance between samples may be missed, and a sharp
+        Samples along each direction, at least 2. Default: 200, or five for each knot span in a direction that
+        has more than 40 of them. Folds narrower than the distance between samples may be missed, and a sharp
         bend of a regular surface counts where it takes less than that distance.
 
     Returns
