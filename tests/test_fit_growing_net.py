@@ -44,6 +44,30 @@ def test_the_order_of_the_points_has_no_influence(grown):
     assert np.abs(moved).max() < 1e-6
 
 
+def test_a_hill_that_few_points_show_is_not_left_out_of_the_average():
+    """With the first net the average is met, and the hill's top is 7 % of the diagonal away."""
+
+    def hill(x, y):
+        return np.stack([x, y, 0.25 * np.exp(-80 * ((x - 0.4) ** 2 + (y - 0.6) ** 2))], axis=-1)
+
+    boundary = jf.Boundary.from_grid(hill(*np.meshgrid(*2 * [np.linspace(0, 1, 80)], indexing="ij")))
+    uneven = hill(*np.random.default_rng(3).beta(0.5, 3.0, size=(2, COUNT)))
+    coarse = jf.fit_points(uneven, boundary, net=(8, 8))
+    assert coarse.converged
+    assert float(coarse.maximum_error) > 0.03
+    fit = jf.fit_points(uneven, boundary)
+    assert fit.converged
+    assert float(fit.maximum_error) < 6e-3
+
+
+def test_single_outliers_take_no_finer_net():
+    astray = CLEAN.copy()
+    astray[::300, 2] += 0.1
+    fits = [jf.fit_points(points, BOUNDARY, tol_average=1e-3) for points in (CLEAN, astray)]
+    assert fits[0].surface.shape == fits[1].surface.shape
+    assert float(fits[1].maximum_error) > 0.03
+
+
 def test_noise_ends_the_growth_and_is_not_followed():
     size, noise = diagonal(CLEAN), 0.01
     noisy = CLEAN + noise * size / np.sqrt(3) * np.random.default_rng(2).normal(size=CLEAN.shape)

@@ -22,6 +22,9 @@ MOST_SIZE = 200  # control points along either direction
 GROWTH, MOST_FACTORS = 1.2, 2
 BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
 LEVEL_STEPS = 20  # iterations with each net but the last
+# Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of its
+# neighbours, is FAR times the average's tolerance away, if the next net brings it so much nearer.
+PATCH, NEARER = 9, 0.8
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
 # A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
@@ -37,11 +40,13 @@ EXTENSIONS = 3  # most nets tried with all points where the chosen one misses th
 
 
 class Level(NamedTuple):
-    """A net, its fit to a part of the points, and the average error of those held out."""
+    """A net, its fit to a part of the points, the average error of those held out, and that of the farthest
+    patch."""
 
     size: float
     fit: Fit
     held_out: float
+    patch: float
 
 
 class NetGrowth:
@@ -62,6 +67,8 @@ class NetGrowth:
         counted = np.flatnonzero(self.weights > 0)
         # Sorted, so that every n-th of them is an even choice, whatever order the points came in.
         self.sorted = counted[np.lexsort(points[counted].T)]
+        average, maximum = request["tol_average"], request["tol_maximum"]
+        self.far = np.inf if average is None or maximum is not None else FAR * float(average)
         self.most = float(np.sqrt(len(counted) / nets.points_a_control_point))
 
     def net(self, size: float) -> tuple[int, int]:
@@ -82,19 +89,30 @@ class NetGrowth:
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
-        best, before, size = None, None, FIRST_SIZE
+        best, met, before, size = None, None, None, FIRST_SIZE
         while True:
-            level = self._level(size, base, before)
-            if bool(level.fit.converged):
-                return level, RESULTS.converged
-            if best is not None and not level.held_out < BETTER * best.held_out:
+            level = self._level(size, base, before, met is not None)
+            if met is not None and not (self._is_met(level) and level.patch < NEARER * met.patch):
+                return met, RESULTS.converged
+            if self._is_met(level):
+                met = level
+                if level.patch <= self.far:
+                    return met, RESULTS.converged
+            elif best is not None and not level.held_out < BETTER * best.held_out:
                 return best, RESULTS.noise_reached
-            best, coarser, size = level, size, size * self._growth(level.fit)
+            best, coarser, size = level, size, size * self._growth(level)
             if size > self.most or self.net(size) == self.net(coarser):
-                return best, RESULTS.net_exhausted
+                return best, RESULTS.net_exhausted if met is None else RESULTS.converged
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 
-    def _level(self, size: float, base: BSplineSurface, before: Level | None) -> Level:
+    def _is_met(self, level: Level) -> bool:
+        """Whether the tolerances that were asked for are met, and not `far`."""
+        average = self.request["tol_average"]
+        near = np.isfinite(self.far) and float(level.fit.average_error) <= average
+        return bool(level.fit.converged or near)
+
+    def _level(self, size: float, base: BSplineSurface, before: Level | None, farther: bool) -> Level:
+        """The fit with a net of this size; `farther` on than the average asks for, to the farthest patch."""
         some, held_out = self._chosen(size)
         start, feet = None, self.nets.feet(self.net(size))
         if feet is not None:
@@ -108,8 +126,11 @@ class NetGrowth:
             "throw": False,
             "errors": LocalFeet(),
         }
+        if farther:
+            request["tol_maximum"] = self.far
         fit = self.fit(self.points[some], base, request)
-        return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()))
+        errors = np.asarray(fit.errors)
+        return Level(size, fit, float(errors[held_out].mean()), farthest_patch(self.points[some], errors))
 
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
@@ -119,16 +140,27 @@ class NetGrowth:
         some = self.sorted[:: -(-len(self.sorted) // most)]
         return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
 
-    def _growth(self, fit: Fit) -> float:
+    def _growth(self, level: Level) -> float:
         """How many times finer the next net is: errors fall about with the square of the size."""
-        goals = self.request["tol_average"], self.request["tol_maximum"]
+        goals = self.request["tol_average"], self.request["tol_maximum"], self.far
+        errors = float(level.fit.average_error), float(level.fit.maximum_error), level.patch
         excess = max(
-            float(error) / goal if goal else np.inf
-            for error, goal in zip((fit.average_error, fit.maximum_error), goals, strict=True)
+            error / goal if goal else np.inf
+            for error, goal in zip(errors, goals, strict=True)
             if goal is not None
         )
         factors = np.round(np.log(np.sqrt(excess)) / np.log(GROWTH))
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
+
+
+def farthest_patch(points: Float[np.ndarray, "points d"], errors: Float[np.ndarray, " points"]) -> float:
+    """The greatest median of the errors of a point and its nearest neighbours, which single outliers leave
+    alone.
+    """
+    from scipy.spatial import KDTree
+
+    beside = KDTree(points).query(points, PATCH, workers=-1)[1]
+    return float(np.median(errors[beside], axis=1).max())
 
 
 def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
