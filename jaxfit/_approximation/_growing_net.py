@@ -22,8 +22,9 @@ MOST_SIZE = 200  # control points along either direction
 GROWTH, MOST_FACTORS = 1.2, 2
 BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
 LEVEL_STEPS = 20  # iterations with each net but the last
-# Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of its
-# neighbours, is FAR times the average's tolerance away, if the next net brings it so much nearer.
+# Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of those
+# with feet beside its own, is FAR times the average's tolerance away, if the next net brings it so much
+# nearer.
 PATCH, NEARER = 9, 0.8
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
@@ -129,8 +130,7 @@ class NetGrowth:
         if farther:
             request["tol_maximum"] = self.far
         fit = self.fit(self.points[some], base, request)
-        errors = np.asarray(fit.errors)
-        return Level(size, fit, float(errors[held_out].mean()), farthest_patch(self.points[some], errors))
+        return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()), farthest_patch(fit))
 
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
@@ -142,7 +142,8 @@ class NetGrowth:
 
     def _growth(self, level: Level) -> float:
         """How many times finer the next net is: errors fall about with the square of the size."""
-        goals = self.request["tol_average"], self.request["tol_maximum"], self.far
+        far = self.far if self._is_met(level) else None
+        goals = self.request["tol_average"], self.request["tol_maximum"], far
         errors = float(level.fit.average_error), float(level.fit.maximum_error), level.patch
         excess = max(
             error / goal if goal else np.inf
@@ -153,14 +154,16 @@ class NetGrowth:
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
 
 
-def farthest_patch(points: Float[np.ndarray, "points d"], errors: Float[np.ndarray, " points"]) -> float:
-    """The greatest median of the errors of a point and its nearest neighbours, which single outliers leave
-    alone.
+def farthest_patch(fit: Fit) -> float:
+    """The greatest median of the errors of a point and of those with the nearest feet: single outliers, that
+    have good points beside their feet, leave it alone.
     """
     from scipy.spatial import KDTree
 
-    beside = KDTree(points).query(points, PATCH, workers=-1)[1]
-    return float(np.median(errors[beside], axis=1).max())
+    sides = zip((fit.u, fit.v), fit.surface.domain, fit.surface.shape, strict=True)
+    feet = np.stack([np.asarray(x) / (end - begin) * n for x, (begin, end), n in sides], axis=1)
+    beside = KDTree(feet, balanced_tree=False).query(feet, PATCH, workers=-1)[1]
+    return float(np.median(np.asarray(fit.errors)[beside], axis=1).max())
 
 
 def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
