@@ -41,8 +41,7 @@ EXTENSIONS = 3  # most nets tried with all points where the chosen one misses th
 
 
 class Level(NamedTuple):
-    """A net, its fit to a part of the points, the average error of those held out, and that of the farthest
-    patch."""
+    """A net, its fit to a part of the points, and the errors of those held out and of the farthest patch."""
 
     size: float
     fit: Fit
@@ -161,7 +160,8 @@ def farthest_patch(fit: Fit) -> float:
     from scipy.spatial import KDTree
 
     sides = zip((fit.u, fit.v), fit.surface.domain, fit.surface.shape, strict=True)
-    feet = np.stack([np.asarray(x) / (end - begin) * n for x, (begin, end), n in sides], axis=1)
+    feet = np.stack([np.asarray(x) * (n / float(end - begin)) for x, (begin, end), n in sides], axis=1)
+    feet = np.nan_to_num(feet)  # of a fit that has diverged, whose errors are not finite either
     beside = KDTree(feet, balanced_tree=False).query(feet, PATCH, workers=-1)[1]
     return float(np.median(np.asarray(fit.errors)[beside], axis=1).max())
 
