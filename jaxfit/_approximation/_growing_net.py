@@ -106,13 +106,13 @@ class NetGrowth:
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 
     def _is_met(self, level: Level) -> bool:
-        """Whether the tolerances that were asked for are met, and not `far`."""
-        average = self.request["tol_average"]
-        near = np.isfinite(self.far) and float(level.fit.average_error) <= average
-        return bool(level.fit.converged or near)
+        """Whether the tolerances that were asked for are met: `far`, a maximum for some levels, is none."""
+        if bool(level.fit.converged):
+            return True
+        return self.far < np.inf and float(level.fit.average_error) <= float(self.request["tol_average"])
 
     def _level(self, size: float, base: BSplineSurface, before: Level | None, farther: bool) -> Level:
-        """The fit with a net of this size; `farther` on than the average asks for, to the farthest patch."""
+        """The fit with a net of this size; with `farther` it goes on to a maximum of `far`, too."""
         some, held_out = self._chosen(size)
         start, feet = None, self.nets.feet(self.net(size))
         if feet is not None:
