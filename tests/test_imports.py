@@ -16,7 +16,7 @@ ROOMS = [
     ("_precision", "_progress_line"),
     ("_varying",),
     ("_kept_programs",),
-    ("_barrier", "_compile", "_program_folder"),
+    ("_unrolling", "_barrier", "_compile", "_program_folder"),
     ("_splines",),
     ("_parameters",),
     ("_cells",),

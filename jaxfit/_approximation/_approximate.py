@@ -66,10 +66,11 @@ def approximate(
     errors : GlobalFeet(), LocalFeet() or AtParameters(), optional
         Where the errors of the fit are measured (default GlobalFeet(), for every method): at true closest
         points, at local foot points, or at the parameters that the method ended with.
-    adjoint : ImplicitAdjoint(), optional
+    adjoint : ImplicitAdjoint() or UnrolledAdjoint(), optional
         What the derivative of the fit is. By default that of the surface at which the method comes to rest,
         `ImplicitAdjoint()`, where the fit is differentiated. Passed explicitly, the surface is polished
-        whether it is differentiated or not.
+        whether it is differentiated or not. `UnrolledAdjoint()` is the derivative of the iterations as they
+        were run, for fits that stop early; `progress` is not called then.
 
     Returns
     -------
@@ -92,8 +93,10 @@ def approximate(
     Fits are differentiable with respect to points, weights, the control points of `base`, and numbers of the
     method such as lambda. Control points of the base that move have the derivative 0: where the fit starts
     from does not matter to where it comes to rest. Those on a border that is held pass theirs on, and so does
-    the boundary that they come from. Knots have none. `ImplicitAdjoint` says when `stats["stationarity"]`
-    permits to trust a derivative; inside `jit` that is NaN unless the fit is differentiated there.
+    the boundary that they come from. Knots have none. With `UnrolledAdjoint` all control points of the base,
+    and `start`, have the derivative of the fit as it was run. `ImplicitAdjoint` says when
+    `stats["stationarity"]` permits to trust a derivative; inside `jit` that is NaN unless the fit is
+    differentiated there.
 
     Points divided among the devices of a mesh (`shard_points`, also of several processes) are fitted where
     they are, by the three methods of this library: each device has the rows of its own points, and one to

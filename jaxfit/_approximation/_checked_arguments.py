@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 
 from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
-from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._scaling import Unit, unit_of
 
@@ -59,7 +59,7 @@ def check_options(
     if errors is not None:
         check_kind("errors", errors, AbstractErrors, "GlobalFeet()")
     if adjoint is not None:
-        check_kind("adjoint", adjoint, ImplicitAdjoint, "ImplicitAdjoint()")
+        check_kind("adjoint", adjoint, AbstractAdjoint, "ImplicitAdjoint()")
     check_steps("max_steps", max_steps)
     for tolerance in (tol_average, tol_maximum):
         if tolerance is not None and is_concrete(tolerance):

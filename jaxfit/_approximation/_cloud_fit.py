@@ -17,9 +17,10 @@ from jaxfit._approximation._implicit_fit import (
     polished_fitted,
     with_implicit_derivative,
 )
+from jaxfit._approximation._unrolled_fit import unrolled_fit
 from jaxfit._checks import as_points, check_kind, is_concrete, without_derivatives
 from jaxfit._closest import closest_point
-from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._adjoints import ImplicitAdjoint, UnrolledAdjoint
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
@@ -69,9 +70,8 @@ def fit_cloud(
     tolerances = tolerances_of(*goals, max_steps)
     problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
     begun = working_surface(base, unit, concrete)
-    nu, nv = base.shape
     if room is not None:
-        begun = begun.padded(room.net[0] - nu, room.net[1] - nv)
+        begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
     if feet is None:
         nearest = closest_point(base, cloud)
         feet = nearest.u, nearest.v
@@ -80,16 +80,20 @@ def fit_cloud(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
-    doing(f"fitting {nu} x {nv} control points to {cloud.shape[0]:,} points")
+    doing(f"fitting {base.shape[0]} x {base.shape[1]} control points to {cloud.shape[0]:,} points")
     entries = max_steps if room is None else room.steps
     loop = begin(method, together, begun, u[order], v[order], entries)
-    loop, stats = run(method, together, loop, request["progress"] if concrete else None)
+    unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
+    if unrolled:
+        first = _end(together, begun, loop, order, unit, begun)
+        loop, stats, unit = unrolled_fit(first, max_steps, *given)
+        cloud, base, method, concrete = *given[:3], is_concrete(given)
+    else:
+        loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = fitted_surface(loop.current.surface, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
-    if request["adjoint"] is not None or not is_concrete(given):
-        here = loop.current
-        knots = begun.knots_u, begun.knots_v
-        end = EndOfFit(together, here.surface, here.state, here.projection, order, unit, knots)
+    if not unrolled and (request["adjoint"] is not None or not is_concrete(given)):
+        end = _end(together, loop.current.surface, loop, order, unit, begun)
         surface, known, unit, share = _differentiable(given, end, surface, known)
         cloud, concrete = given[0], is_concrete(given)
         stats = stats | {"stationarity": share}
@@ -105,24 +109,22 @@ def fit_cloud(
     return converged_or_raise(fit) if request["throw"] else fit
 
 
+def _end(
+    problem: Problem, surface: WorkingSurface, loop: LoopState, order: Any, unit: Unit, begun: WorkingSurface
+) -> EndOfFit:
+    here, knots = loop.current, (begun.knots_u, begun.knots_v)
+    return EndOfFit(problem, surface, here.state, here.projection, order, unit, knots)
+
+
 def _differentiable(
     given: Any, end: EndOfFit, surface: BSplineSurface, known: Feet
 ) -> tuple[BSplineSurface, Feet, Unit, Any]:
     """The fit as a function of what is `given`: surface, feet, the unit with its diagonal, and how stationary
     it is: NaN where that is not known.
     """
-    cloud, base, method, request = given
+    _, base, method, request = given
     dtype = end.problem.target.dtype
-    numbers, rest = dynamic_fields(method)
-    numbers = jax.tree.map(lambda x: jnp.asarray(x, dtype) if is_concrete(x) else x.astype(dtype), numbers)
-    weights, start = request["weights"], request["start"]
-    inputs = FitInputs(
-        jnp.asarray(cloud, dtype),
-        None if weights is None else jnp.asarray(weights, dtype),
-        numbers,
-        jnp.asarray(base.control_points, dtype),
-        None if start is None else (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype)),
-    )
+    inputs, (_, rest) = FitInputs.of(*given), dynamic_fields(method)
     adjoint = request["adjoint"]
     if adjoint is None:
         net = jnp.asarray(end.unit.outward(jnp.asarray(end.surface.control_points, dtype)), dtype)

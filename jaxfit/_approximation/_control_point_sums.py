@@ -12,6 +12,7 @@ from jaxfit._barrier import materialise
 from jaxfit._cells import Rows, cells_to_net, row_moments
 from jaxfit._closest import PointSums, dot
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import root
 
 
 class WeightedErrors(eqx.Module):
@@ -70,7 +71,7 @@ class ControlPointSums(PointSums):
 
         def summands(e: Array, weight: Array) -> Array:
             if self.weigh is not None:
-                weight = self.weigh(weight, jnp.sqrt(dot(e, e)))
+                weight = self.weigh(weight, root(dot(e, e)))
             return jnp.concatenate([weight[None] * e, weight[None]])
 
         values = materialise(part.used > 0, summands, e, weight)

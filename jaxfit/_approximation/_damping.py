@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis
+from jaxfit._unrolling import root
 
 # The ratio of the actual to the predicted reduction: below POOR the damping rises, above GOOD it falls.
 POOR, GOOD = 0.25, 0.5
@@ -78,14 +79,14 @@ def longest_moves(net: Float[Array, "nu nv d"], reach: Any, used: Any) -> Float[
 
 def within_reach(move: Float[Array, "nu nv d"], longest: Float[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
     """The move of each control point, no longer than it may be."""
-    length = jnp.sqrt(jnp.sum(move**2, axis=-1))
+    length = root(jnp.sum(move**2, axis=-1))
     far = length > longest
     return jnp.where(far, longest / jnp.where(far, length, 1.0), 1.0)[:, :, None] * move
 
 
 def _spacing(net: Float[Array, "n m d"], used: Any) -> Float[Array, "n m"]:
     """Mean distance to the neighbours along the first direction."""
-    legs = jnp.sqrt(jnp.sum(jnp.diff(net, axis=0) ** 2, axis=-1))
+    legs = root(jnp.sum(jnp.diff(net, axis=0) ** 2, axis=-1))
     before, after = jnp.concatenate([legs[:1], legs]), jnp.concatenate([legs, legs[-1:]])
     last = np.arange(net.shape[0])[:, None] == used - 1
     return 0.5 * (before + jnp.where(last, before, after))

@@ -38,6 +38,7 @@ from jaxfit._cells import (
 )
 from jaxfit._normal_equations import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import without_influence
 
 
 class NormalEquations(eqx.Module):
@@ -62,7 +63,7 @@ def normal_equations(
 ) -> NormalEquations:
     """The normal equations at feet (u, v), for `damping` mu; points of weight 0 take no part."""
     pieces = jax.tree.map(jnp.asarray, pieces)
-    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), weight <= 0)
+    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), without_influence(weight))
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
     pairs = d * (d + 1) // 2
     always = problem.diagonal > 0

@@ -14,6 +14,7 @@ from jaxfit._normal_equations import (
     free_points,
     solve_coupled,
 )
+from jaxfit._unrolling import constant, root
 
 RESIDUAL = 1e-5  # of a step's linear system, where conjugate gradients stop
 # Or after so many: few, for far from the end an exact solution is no better. At small mu steps
@@ -45,7 +46,7 @@ def gauss_newton_step(
     # Data weighs 1 across the surface and mu along it, smoothing the same in all directions; factors for the
     # geometric mean serve both.
     between = data.times(jnp.sqrt(damping)).plus(stiffness)
-    preconditioner = coupled_preconditioner(matrix, between, free)
+    preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     corrected = damping < 1
     most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
@@ -68,5 +69,5 @@ def gauss_newton_step(
 
 def _at_most(share: float, correction: Array, move: Array) -> Array:
     """The correction, no longer than a share of the move."""
-    length, most = jnp.sqrt(jnp.sum(correction**2)), share * jnp.sqrt(jnp.sum(move**2))
+    length, most = root(jnp.sum(correction**2)), share * root(jnp.sum(move**2))
     return jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0) * correction

@@ -26,6 +26,7 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import unrolled
 from jaxfit._varying import as_varying
 
 
@@ -250,6 +251,10 @@ class GeometricApproximation(AbstractIterativeMethod):
             steps = jnp.where((number > 0) & certain, feet.evaluations, new.evaluations)
             return number + 1, eqx.tree_at(lambda f: f.evaluations, new, steps), sums.sums
 
+        if unrolled():  # converged feet, once for the weights and once for the sums
+            feet, _ = update(u, v, before.error)
+            feet, sums = update(feet.u, feet.v, feet.error)
+            return feet, sums.sums
         certain = exact | (not self.single_step)
         first = FootUpdate(u, v, before.error, before.evaluations, before.converged)
         begin = (jnp.where(certain, 0, 1), first, state.sums)

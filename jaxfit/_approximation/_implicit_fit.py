@@ -25,11 +25,13 @@ from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
 from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._method import dynamic_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._precision import default_foot_tolerance
+from jaxfit._precision import default_foot_tolerance, working_dtype
+from jaxfit._splines import BSplineSurface
 from jaxfit._splines._insertion import insertion_weights
 from jaxfit._splines._lookup import windows
 
@@ -46,6 +48,23 @@ class FitInputs(eqx.Module):
     numbers: Any
     control_points: Float[Array, "nu nv d"]
     start: tuple[Array, Array] | None
+
+    @staticmethod
+    def of(cloud: Any, base: BSplineSurface, method: Any, request: dict[str, Any]) -> "FitInputs":
+        """Of the arguments of `approximate`, in the working precision."""
+        dtype = working_dtype()
+        numbers, _ = dynamic_fields(method)
+        numbers = jax.tree.map(
+            lambda x: jnp.asarray(x, dtype) if is_concrete(x) else x.astype(dtype), numbers
+        )
+        weights, start = request["weights"], request["start"]
+        return FitInputs(
+            jnp.asarray(cloud, dtype),
+            None if weights is None else jnp.asarray(weights, dtype),
+            numbers,
+            jnp.asarray(base.control_points, dtype),
+            None if start is None else (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype)),
+        )
 
 
 class EndOfFit(eqx.Module):
@@ -142,8 +161,8 @@ def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs)
 
     def residual(net: Array) -> StationarityResidual:
         method = eqx.combine(inputs.numbers, rest)
-        problem, still = _problem(end, inputs), _base_net(end, inputs)
-        u, v = (here.u, here.v) if method.finds_feet else _given_feet(end, inputs)
+        problem, still = problem_of(end, inputs), base_net_of(end, inputs)
+        u, v = (here.u, here.v) if method.finds_feet else given_feet_of(end, inputs)
         feet = feet_in_rows(surface, end.problem, u, v)
         args = (method, end.state, end.surface.moved_to(net), problem, feet)
         return stationarity_residual(*args, system.free, still)
@@ -171,16 +190,16 @@ def _outward(
         return jnp.zeros(count, x.dtype).at[number].set(x, mode="drop")
 
     moved = net * unit.scale + unit.centre[None, None]
-    kept = _base_net(end, inputs) * unit.scale + unit.centre[None, None]
+    kept = base_net_of(end, inputs) * unit.scale + unit.centre[None, None]
     if inputs.control_points.shape == net.shape:
         kept = inputs.control_points.astype(net.dtype)  # to the last bit
     net = jnp.where(at_rest.system.free[:, :, None], moved, kept)
     error = by_point(found.error) * unit.scale
-    diagonal = _problem(end, inputs).diagonal * unit.scale
+    diagonal = problem_of(end, inputs).diagonal * unit.scale
     return Fitted(net, by_point(found.u), by_point(found.v), error, diagonal, at_rest.stationarity)
 
 
-def _problem(end: EndOfFit, inputs: FitInputs) -> Problem:
+def problem_of(end: EndOfFit, inputs: FitInputs) -> Problem:
     """The problem as a function of the inputs. The diagonal follows the points; scale and centre need not."""
     unit, problem = end.unit, end.problem
     inner = (inputs.points - unit.centre[None]) / unit.scale
@@ -198,7 +217,7 @@ def _problem(end: EndOfFit, inputs: FitInputs) -> Problem:
     return eqx.tree_at(lambda p: (p.target, p.weight, p.diagonal), problem, (target, weight, diagonal))
 
 
-def _base_net(end: EndOfFit, inputs: FitInputs) -> Float[Array, "nu nv d"]:
+def base_net_of(end: EndOfFit, inputs: FitInputs) -> Float[Array, "nu nv d"]:
     """The base surface on the knots of the final one, in the unit of the problem."""
     net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
     net = net.astype(end.surface.control_points.dtype)
@@ -212,14 +231,14 @@ def _base_net(end: EndOfFit, inputs: FitInputs) -> Float[Array, "nu nv d"]:
     return net
 
 
-def _given_feet(end: EndOfFit, inputs: FitInputs) -> tuple[Array, Array]:
+def given_feet_of(end: EndOfFit, inputs: FitInputs) -> tuple[Array, Array]:
     """The parameters that the fit was given, or those of the closest points on the base surface."""
     feet = end.projection.u, end.projection.v
     spare = end.order.shape[0] - inputs.points.shape[0]
     if inputs.start is not None:
         u, v = (jnp.pad(x, (0, spare), mode="edge")[end.order] for x in inputs.start)
         return u.astype(feet[0].dtype), v.astype(feet[0].dtype)
-    problem = _problem(end, inputs)
+    problem = problem_of(end, inputs)
     tolerance = default_foot_tolerance(feet[0].dtype) * problem.diagonal
     net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
     return as_feet(feet, (net, *end.knots), problem.target.T, tolerance)

@@ -32,6 +32,7 @@ from jaxfit._cells import (
 )
 from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import without_influence
 
 LEAST_SHARE = 0.5  # the share of the first form that must be left in the Hessian
 
@@ -48,7 +49,7 @@ def second_order_rhs(
     the correction of that move, as the residuals are for the move itself.
     """
     pieces, moves = jax.tree.map(jnp.asarray, (pieces, moves))
-    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), weight <= 0)
+    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), without_influence(weight))
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
     always = problem.diagonal > 0
     values = jnp.concatenate([problem.target, jnp.stack([u, v, weight])])

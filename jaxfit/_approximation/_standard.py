@@ -13,6 +13,7 @@ from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion
 from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
+from jaxfit._approximation._unrolled_solution import unrolled_solution
 from jaxfit._cells import values_at
 from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
@@ -25,6 +26,7 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import RegularisedSystem, ThinPlate, WeightedPlate, make_system
+from jaxfit._unrolling import root, unrolled
 
 
 class StandardState(eqx.Module):
@@ -163,7 +165,7 @@ class StandardApproximation(AbstractIterativeMethod):
             return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
         idle = ~jnp.asarray(problem.real)
         error = values_at(surface.pieces, before.u, before.v) - problem.target
-        distance = jnp.sqrt(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
+        distance = root(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
         active = jnp.sum(problem.counted, dtype=jnp.int32)
         return Projection(
             *(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True)),
@@ -182,7 +184,8 @@ class StandardApproximation(AbstractIterativeMethod):
         """The least-squares net at the present parameters, then new knots if it is time."""
         surface, here, state = iterate.surface, iterate.projection, iterate.state
         system = self.system(problem, surface, here, state.smoothing, state.plate)
-        net, shift = self.solver(least_squares_problem(system, self.held(surface), surface.control_points))
+        solve = unrolled_solution if unrolled() else self.solver
+        net, shift = solve(least_squares_problem(system, self.held(surface), surface.control_points))
         net = net + 0.0 * state.smoothing  # NaN for a traced lambda that is none
         surface, step = surface.moved_to(net), iterate.step + 1
         if self.insertion is not None:

@@ -26,7 +26,7 @@ from jaxfit._cells import (
 )
 from jaxfit._cells import local_coordinates as local_coordinates_of
 from jaxfit._closest import dot
-from jaxfit._closest._implicit import foot_change
+from jaxfit._closest._implicit import foot_moves
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity import Stationarity
@@ -100,7 +100,7 @@ def stationarity_residual(
     monomials = _monomials(s, t, order_u, order_v)
     jet = _following(row_coefficients(pieces, feet.rows), s, t, monomials)
     if method.finds_feet:
-        ds, dt = _foot_moves(pieces, feet, target, jet, problem)
+        ds, dt = foot_moves(pieces, (feet.u, feet.v), target, jet, problem.diagonal)
     else:
         ds, dt = feet.s - s, feet.t - t
     along_s, along_t = jax.lax.stop_gradient((jet.s, jet.t))
@@ -186,36 +186,6 @@ def _sizes(
     data, places = jnp.sqrt(jnp.sum(sums**2, axis=(0, 1)))
     terms = data + jnp.sqrt(jnp.sum(jnp.where(inside, smooth, 0.0) ** 2))
     return terms, ROUNDING * jnp.finfo(value.dtype).eps * places
-
-
-def _foot_moves(
-    pieces: Pieces, feet: FeetInRows, target: Array, jet: Any, problem: Problem
-) -> tuple[Array, Array]:
-    """Zero, with the derivative of the feet in local coordinates."""
-    e = target - jet.value
-    slopes = dot(e, jet.s), dot(e, jet.t)
-    form = dot(jet.s, jet.s), dot(jet.s, jet.t), dot(jet.t, jet.t)
-    second = dot(e, jet.ss), dot(e, jet.st), dot(e, jet.tt)
-    hessian = tuple(x - y for x, y in zip(form, second, strict=True))
-    ends = tuple(x for a in (pieces.axis_u, pieces.axis_v) for x in (a.breaks[0], a.breaks[-1]))
-    tolerance = FOOT_TOLERANCE * jnp.sqrt(jnp.finfo(e.dtype).eps) * problem.diagonal
-    fixed = jax.lax.stop_gradient(((feet.u, feet.v), form, hessian, ends, tolerance))
-    return _moved(slopes, fixed)
-
-
-FOOT_TOLERANCE = 1e-2  # roots of the rounding unit, over 100: tangential residuals beyond this are a crease's
-
-
-@jax.custom_jvp
-def _moved(slopes: tuple[Array, Array], fixed: Any) -> tuple[Array, Array]:
-    return jnp.zeros_like(slopes[0]), jnp.zeros_like(slopes[1])
-
-
-@_moved.defjvp
-def _moved_jvp(primals: Any, tangents: Any) -> Any:
-    slopes, (feet, form, hessian, ends, tolerance) = primals
-    changes = foot_change(feet, slopes, form, hessian, tangents[0], ends, tolerance)
-    return _moved(*primals), changes
 
 
 def _length(x: Float[Array, "d rows width"]) -> Float[Array, "rows width"]:

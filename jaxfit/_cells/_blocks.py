@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from jaxfit._cells._rows import Rows
+from jaxfit._unrolling import unrolled
 from jaxfit._varying import as_varying
 
 # On a CPU, what a block computes stays in the caches. Elsewhere everything goes at once.
@@ -24,6 +25,8 @@ def over_blocks(
     `filled` are the slots of a block that hold a point which has not been seen before: the last block
     is moved back where fewer rows are left.
     """
+    if unrolled():
+        return add(rows, rows.filled, begin)
     count, width = rows.point.shape
     on_cpu = jax.default_backend() == "cpu"
     size = min(count, max(slots // width, 1)) if on_cpu else count

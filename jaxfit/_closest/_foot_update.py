@@ -4,14 +4,17 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._closest._foot_methods import AbstractFootMethod
-from jaxfit._closest._foot_states import FOUND, SUMMED_FOUND, FootLimits
+from jaxfit._closest._foot_states import FOUND, SUMMED_FOUND, FootLimits, FootStates
 from jaxfit._closest._iterate_feet import PointSums, iterate_feet
 from jaxfit._closest._project import ParameterBounds, in_precision_of, initial_feet
+from jaxfit._closest._unrolled_feet import follow_feet
+from jaxfit._precision import default_foot_tolerance
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import unrolled
 
 MAX_STEPS = 40
 
@@ -90,9 +93,35 @@ def update_feet(
     ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
     pieces = in_precision_of(target, pieces)
+    if unrolled():
+        # A foot's derivative is that of the closest point, so the foot has to be one.
+        least = default_foot_tolerance(target.dtype) * jnp.max(jnp.abs(target))
+        fixed = lax.stop_gradient((pieces, target, u, v, jnp.minimum(tolerance, least)))
+        feet, _ = _found(method, *fixed, idle, max_steps, False, within, None, None)
+        here = feet.best_u, feet.best_v
+        u, v, error, total = follow_feet(pieces, target, here, (u, v), idle, sums, weight)
+        return FootUpdate(u, v, error, feet.steps, feet.converged), total
+    given = pieces, target, u, v, tolerance, idle
+    feet, found = _found(method, *given, max_steps, single_step, within, sums, weight)
+    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.squared_distance)))
+    return FootUpdate(feet.best_u, feet.best_v, error, feet.steps, feet.converged), found
+
+
+def _found(
+    method: AbstractFootMethod,
+    pieces: Pieces,
+    target: Array,
+    u: Array,
+    v: Array,
+    tolerance: Array,
+    idle: Array,
+    max_steps: Any,
+    single_step: Any,
+    within: ParameterBounds | None,
+    sums: PointSums | None,
+    weight: Array | None,
+) -> tuple[FootStates, Any]:
     limits = FootLimits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     done = FOUND if sums is None else SUMMED_FOUND
     feet, bounds = initial_feet(pieces, u, v, idle, within, done)
-    feet, found = iterate_feet(method, pieces, target, feet, limits, bounds, sums, weight, single_step)
-    error = jnp.where(idle, 0.0, jnp.sqrt(jnp.where(idle, 0.0, feet.squared_distance)))
-    return FootUpdate(feet.best_u, feet.best_v, error, feet.steps, feet.converged), found
+    return iterate_feet(method, pieces, target, feet, limits, bounds, sums, weight, single_step)

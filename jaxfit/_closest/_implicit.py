@@ -13,14 +13,16 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._cells._polynomials import PARTIALS
+from jaxfit._cells._polynomials import PARTIALS, Jet
 from jaxfit._closest._foot_methods import AbstractFootMethod
+from jaxfit._closest._forms import dot
 from jaxfit._closest._project import ParameterBounds, project
 from jaxfit._closest._samples import best_samples, sample_points
 from jaxfit._splines._evaluate import evaluate_surface
-from jaxfit._splines._pieces import make_pieces
+from jaxfit._splines._pieces import Pieces, make_pieces
 
 Arrays = tuple[Array, Array, Array]  # control points and both knot vectors
+FOOT_TOLERANCE = 1e-2  # roots of the rounding unit, over 100: tangential residuals beyond this are a crease's
 
 
 def searched_feet(
@@ -159,3 +161,29 @@ def _solve(
     du = (c * x - b * y) * inverse + jnp.where(along_u, x / jnp.where(along_u, a, 1.0), 0.0)
     dv = (a * y - b * x) * inverse + jnp.where(along_v, y / jnp.where(along_v, c, 1.0), 0.0)
     return du, dv
+
+
+def foot_moves(
+    pieces: Pieces, feet: tuple[Array, Array], target: Array, jet: Jet, extent: Array
+) -> tuple[Array, Array]:
+    """Zero, with the derivative of the feet in local coordinates; `extent` is that of the points."""
+    e = target - jet.value
+    slopes = dot(e, jet.s), dot(e, jet.t)
+    form = dot(jet.s, jet.s), dot(jet.s, jet.t), dot(jet.t, jet.t)
+    second = dot(e, jet.ss), dot(e, jet.st), dot(e, jet.tt)
+    hessian = tuple(x - y for x, y in zip(form, second, strict=True))
+    ends = tuple(x for a in (pieces.axis_u, pieces.axis_v) for x in (a.breaks[0], a.breaks[-1]))
+    tolerance = FOOT_TOLERANCE * jnp.sqrt(jnp.finfo(e.dtype).eps) * extent
+    return _moved(slopes, lax.stop_gradient((feet, form, hessian, ends, tolerance)))
+
+
+@jax.custom_jvp
+def _moved(slopes: tuple[Array, Array], fixed: Any) -> tuple[Array, Array]:
+    return jnp.zeros_like(slopes[0]), jnp.zeros_like(slopes[1])
+
+
+@_moved.defjvp
+def _moved_jvp(primals: Any, tangents: Any) -> Any:
+    slopes, (feet, form, hessian, ends, tolerance) = primals
+    changes = foot_change(feet, slopes, form, hessian, tangents[0], ends, tolerance)
+    return _moved(*primals), changes

@@ -25,6 +25,14 @@ class AbstractAdjoint(eqx.Module):
 class UnrolledAdjoint(AbstractAdjoint):
     r"""The derivative of the fit as run, which finite differences agree with.
 
+    Of an approximation: of every iteration, in what the iteration before has left. It is right wherever the
+    fit stops, also after `max_steps=5`, and points, weights, numbers of the method, the base surface and
+    `start` all have one. The iteration is run so that it can be followed: feet converge in each iteration,
+    without the short cuts of `single_step`, and linear systems are solved to rounding, so the surface differs
+    a little from that of a fit without a derivative. What is decided (whether a step is accepted, where knots
+    are inserted, which lambda is chosen, when the fit ends) counts as constant; where it is about to change,
+    one-sided derivatives differ. At rest `ImplicitAdjoint` is faster, and needs no memory for iterations.
+
     Of an interpolation: feet are followed through the iterations before they are held, each by the implicit
     derivative of its closest point. The net then solves $N(\hat u, \hat v) P = Q$, and so does its derivative
 
@@ -36,11 +44,16 @@ class UnrolledAdjoint(AbstractAdjoint):
     ----------
     moves_followed : int, optional
         Through how many moves; default as many as move feet, `freeze_after`, or 200 where feet are never
-        held. Reverse mode runs each a second time and keeps one net for each. Interpolation only.
+        held. Reverse mode runs each a second time and keeps one net for each. Interpolation only; an
+        approximation is followed through all its iterations, of which reverse mode runs each three times and
+        keeps about `max_steps` / 16 + 16 states with the feet of all points.
 
     Notes
     -----
-    Source: the derivative of equations (13) and (14) of Kineri, Wang, Lin and Maekawa (2012).
+    Source: the derivative of equations (13) and (14) of Kineri, Wang, Lin and Maekawa (2012), and of the
+    methods of its section 4. Iterations are kept as by A. Griewank, Achieving logarithmic growth of temporal
+    and spatial complexity in reverse automatic differentiation, Optim. Methods Softw. 1, 1992, on two
+    levels.
 
     Examples
     --------

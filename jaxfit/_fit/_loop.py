@@ -24,10 +24,12 @@ from jaxfit._fit._problem import Problem, summary_of
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._unrolling import unrolled
 from jaxfit._varying import as_varying, as_varying_as
 
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
+BLOCK = 16  # iterations of an unrolled fit that are kept at a time
 MAX_GROWTH = 1e3  # average errors beyond this many times the first one count as divergence
 
 Progress = Callable[[int, int, float, float], None]
@@ -101,9 +103,12 @@ def _advance(
 
 
 def iterate(
-    rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState
+    rest: Any, numbers: Any, problem: Problem, until: Array, loop: LoopState, most: int | None = None
 ) -> tuple[LoopState, dict[str, Any]]:
-    """Iterate up to step `until`, or to the end, and postprocess; `rest` are the method's static fields."""
+    """Iterate up to step `until`, or to the end, and postprocess; `rest` are the method's static fields.
+
+    With `most`, the largest number of measurements, it has a derivative where it is traced `unrolling`.
+    """
     method = eqx.combine(numbers, rest)
     running = code_of(RESULTS.running)
 
@@ -112,16 +117,43 @@ def iterate(
 
     if problem.axis is None:  # each device its own fit: all of it differs from device to device
         loop = as_varying(loop, numbers, problem, loop)
-    loop = lax.while_loop(unfinished, partial(_one_iteration, method, problem), loop)
+    step = partial(_one_iteration, method, problem)
+    if most is None:
+        loop = lax.while_loop(unfinished, step, loop)
+    else:
+        loop = _as_often(most, unfinished, step, loop)
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
     last, stats = method.postprocess(problem, loop.current, early)
     return eqx.tree_at(lambda x: x.current, loop, last), stats
 
 
+def _as_often(
+    most: int,
+    unfinished: Callable[[LoopState], Array],
+    step: Callable[[LoopState], LoopState],
+    loop: LoopState,
+) -> LoopState:
+    """`step` as long as the fit is `unfinished`, which is `most` times at most, with a derivative.
+
+    Reverse mode keeps the states that blocks of iterations begin with, and those within one block.
+    """
+
+    @jax.checkpoint
+    def one(loop: LoopState, _: None) -> tuple[LoopState, None]:
+        return lax.cond(unfinished(loop), step, lambda loop: loop, loop), None
+
+    @jax.checkpoint
+    def block(loop: LoopState, _: None) -> tuple[LoopState, None]:
+        return lax.scan(one, loop, None, min(most, BLOCK))
+
+    return lax.scan(block, loop, None, -(-most // BLOCK))[0]
+
+
 def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> LoopState:
     """Measure, accept, record, decide, move."""
     old, new = loop.current, loop.next
-    projection, state = method.measure(problem, new, loop.exact)
+    exact = jnp.asarray(True) if unrolled() else loop.exact
+    projection, state = method.measure(problem, new, exact)
     projection, state = _over_all_points(problem, projection, old.projection, state)
     new = as_varying_as(Iterate(new.surface, projection, state, new.step), new)
     new = lax.cond(new.step > 0, lambda: method.accept(problem, old, new), lambda: new)

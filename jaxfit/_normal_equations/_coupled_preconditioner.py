@@ -11,6 +11,7 @@ from jaxfit._normal_equations._block_cholesky import Factors, factorise, substit
 from jaxfit._normal_equations._conjugate_gradients import CGSolution, conjugate_gradients
 from jaxfit._normal_equations._coupled_stencil import CoupledStencil
 from jaxfit._normal_equations._stencil import Stencil
+from jaxfit._unrolling import unrolled
 
 LEAST_SHARE = 1e-12  # of a coordinate direction in what a control point weighs
 
@@ -65,4 +66,7 @@ def solve_coupled(
         return jnp.where(inside, matrix(x), 0.0)
 
     right = jnp.where(inside, right, 0.0)
-    return conjugate_gradients(masked, right, preconditioner, rtol, max_steps, coupled=True)
+    solution = conjugate_gradients(masked, right, preconditioner, rtol, max_steps, coupled=True)
+    if unrolled():  # in reverse mode what is on the right-hand side comes in here
+        solution = solution._replace(net=jnp.where(inside, solution.net, 0.0))
+    return solution

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from jaxfit._cells import Rows, overlap_add, row_moments
 from jaxfit._normal_equations._stencil import Stencil, shifted_slices
 from jaxfit._splines._pieces import Axis
+from jaxfit._unrolling import unrolled
 from jaxfit._varying import as_varying
 
 # On a CPU, powers and moments of so many points stay in a core's caches. Elsewhere all go at once.
@@ -59,6 +60,8 @@ def cell_moments(
         return start + size, total.at[cell].add(row_moments(x, y, value, *orders))
 
     nothing = jnp.zeros((cells, orders[0], orders[1] * values.shape[0]), s.dtype)
+    if unrolled():
+        return nothing.at[rows.cell].add(row_moments(s, t, values, *orders))
     nothing = as_varying(nothing, rows, values)
     return lax.while_loop(lambda x: x[0] < rows.used, block, (jnp.asarray(0, jnp.int32), nothing))[1]
 

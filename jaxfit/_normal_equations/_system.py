@@ -28,6 +28,7 @@ from jaxfit._normal_equations._normal_matrix import cell_moments, normal_stencil
 from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+from jaxfit._unrolling import constant, without_influence
 
 LEAST_INFLUENCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
 
@@ -35,11 +36,12 @@ Residual = tuple[Float[Array, "d rows width"], Bending]
 
 
 class RegularisedSystem(eqx.Module):
-    """Points in rows, with the square roots of their weights (0 for empty slots)."""
+    """Points in rows, with their weights (0 for empty slots) and the square roots of these."""
 
     rows: Rows
     s: Float[Array, "rows width"]
     t: Float[Array, "rows width"]
+    weight: Float[Array, "rows width"]
     root: Float[Array, "rows width"]
     target: Float[Array, "d rows width"]
     axis_u: Axis
@@ -49,7 +51,7 @@ class RegularisedSystem(eqx.Module):
 
     def data_stencil(self) -> Stencil:
         """A^T W A."""
-        return normal_stencil(self.rows, self.s, self.t, self.root**2, self.axis_u, self.axis_v)
+        return normal_stencil(self.rows, self.s, self.t, self.weight, self.axis_u, self.axis_v)
 
     def stencil(self) -> Stencil:
         """The normal matrix A^T W A + lambda A_fair of (11)."""
@@ -57,9 +59,12 @@ class RegularisedSystem(eqx.Module):
 
     def data_residual(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
         """sqrt(w) (A P - Q)."""
+        return self.root[None] * self.distances(net)
+
+    def distances(self, net: Float[Array, "nu nv d"]) -> Float[Array, "d rows width"]:
+        """A P - Q."""
         pieces = pieces_on(net, self.axis_u, self.axis_v)
-        on_surface = evaluate_values(row_coefficients(pieces, self.rows), self.s, self.t)
-        return self.root[None] * (on_surface - self.target)
+        return evaluate_values(row_coefficients(pieces, self.rows), self.s, self.t) - self.target
 
     def residual(self, net: Float[Array, "nu nv d"]) -> Residual:
         """Both parts of what is squared and summed."""
@@ -74,9 +79,17 @@ class RegularisedSystem(eqx.Module):
 
     def data_adjoint(self, residual: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
         """A^T sqrt(w) times a residual of the data."""
+        return self.summed(self.root[None] * residual)
+
+    def half_gradient(self, net: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
+        """Half the gradient of F, in a form that is differentiable in weights and lambda that are 0."""
+        data = self.summed(self.weight[None] * self.distances(net))
+        return data + self.smoothing * self.plate.adjoint(self.plate.residual(net))
+
+    def summed(self, values: Float[Array, "d rows width"]) -> Float[Array, "nu nv d"]:
+        """A^T times values at the points."""
         polynomials = self.axis_u.polynomials, self.axis_v.polynomials
         orders, cells = [x.shape[1] for x in polynomials], self.axis_u.cells * self.axis_v.cells
-        values = self.root[None] * residual
         moments = cell_moments(self.rows, self.s, self.t, values, (orders[0], orders[1]), cells)
         return cells_to_net(moments, *polynomials)
 
@@ -94,17 +107,17 @@ def make_system(
     plate may be given.
     """
     width = row_width(u.shape[0], pieces.cells)
-    rows = rows_of(pieces, u, v, width, weight <= 0)
+    rows = rows_of(pieces, u, v, width, without_influence(weight))
 
-    def in_rows() -> tuple[Array, Array, Array, Array]:
+    def in_rows() -> tuple[Array, Array, Array, Array, Array]:
         spread = rows.spread(jnp.concatenate([jnp.stack([u, v, weight]), target]))
         s, t = local_coordinates(pieces, rows.cell[:, None], spread[0], spread[1])
-        root = jnp.sqrt(jnp.where(rows.filled, spread[2], 0.0))
-        return s, t, root, spread[3:]
+        own = jnp.where(rows.filled, spread[2], 0.0)
+        return s, t, own, jnp.sqrt(constant(own)), spread[3:]
 
-    s, t, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], in_rows)
+    s, t, own, root, goal = materialise(u[0] >= pieces.axis_u.breaks[0], in_rows)
     plate = thin_plate(pieces.axis_u, pieces.axis_v) if plate is None else plate
-    return RegularisedSystem(rows, s, t, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
+    return RegularisedSystem(rows, s, t, own, root, goal, pieces.axis_u, pieces.axis_v, plate, smoothing)
 
 
 def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu nv"]:
