@@ -104,6 +104,17 @@ def test_it_runs_in_jit_and_vmap(base, fit):
     assert np.abs(np.asarray(batch[1] - jax.jit(net)(jnp.asarray(POINTS) + 0.01))).max() < 1e-12
 
 
+def test_its_iterations_have_a_derivative(base):
+    def corner(points):
+        fit = jf.approximate(points, base, HeavyBall(), max_steps=3, adjoint=jf.UnrolledAdjoint())
+        return fit.surface(0.3, 0.6)[2] + jnp.sum(fit.errors)
+
+    points = jnp.asarray(POINTS)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=points.shape))
+    slope = (float(corner(points + 1e-6 * along)) - float(corner(points - 1e-6 * along))) / 2e-6
+    assert float(jnp.vdot(jax.grad(corner)(points), along)) == pytest.approx(slope, rel=1e-5)
+
+
 def test_the_loop_names_no_method():
     names = "Geometric|Standard|Orthogonal|Nesterov|momentum|fairing|damping|insertion|smoothing|isinstance"
     for name in ("_loop.py", "_method.py"):

@@ -153,11 +153,12 @@ class AbstractIterativeMethod(eqx.Module):
         `state` is the last one, and `error` are the distances of the points, here those of `surface`. It is
         differentiated with respect to the points, the weights, the control points and the method's numbers,
         so these have to come from the arguments, not from the state. A method need not have this function;
-        its fits then have no derivative.
+        its fits then have no derivative but that of `UnrolledAdjoint`, which needs nothing of a method whose
+        loops are those of `update_feet`.
         """
         raise TypeError(
             f"a fit by {type(self).__name__} has no derivative, since it names no condition that its final "
-            "surface meets; give it a function `stationarity`."
+            "surface meets; give it a function `stationarity`, or pass adjoint=UnrolledAdjoint()."
         )
 
 

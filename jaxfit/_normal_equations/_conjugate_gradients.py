@@ -40,18 +40,17 @@ def conjugate_gradients(
     iteration, so any intermediate solution is a direction of descent. Unless the channels are `coupled`, each
     has its own step length.
     """
-
     if unrolled():
-        return _exactly(matrix, right, preconditioner)
+        return _exactly(matrix, right, preconditioner, coupled)
     return _iterate(matrix, right, preconditioner, rtol, max_steps, coupled)
 
 
-def _exactly(matrix: Operator, right: Array, preconditioner: Operator) -> CGSolution:
+def _exactly(matrix: Operator, right: Array, preconditioner: Operator, coupled: bool) -> CGSolution:
     """To rounding: the derivative is that of the solution, not of the iterations."""
     rtol = ROUNDING * float(jnp.finfo(right.dtype).eps)
 
     def solve(matrix: Operator, right: Array) -> Array:
-        return _iterate(matrix, right, preconditioner, rtol, MOST_STEPS, True).net
+        return _iterate(matrix, right, preconditioner, rtol, MOST_STEPS, coupled).net
 
     net = lax.custom_linear_solve(matrix, right, solve, symmetric=True)
     return CGSolution(net, jnp.zeros_like(right), jnp.asarray(True), jnp.asarray(0, jnp.int32))
