@@ -43,7 +43,10 @@ def without_influence(weight: Float[Array, " points"]) -> Bool[Array, " points"]
 
 def root(square: Float[Array, "..."]) -> Float[Array, "..."]:
     """Square roots; where that is unrolled, with the derivative 0 at 0."""
-    if not unrolled():
-        return jnp.sqrt(square)
+    return root_with_slope(square) if unrolled() else jnp.sqrt(square)
+
+
+def root_with_slope(square: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Square roots, with the derivative 0 at 0."""
     positive = square > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

@@ -112,6 +112,7 @@ def fit_cloud(
 def _end(
     problem: Problem, surface: WorkingSurface, loop: LoopState, order: Any, unit: Unit, begun: WorkingSurface
 ) -> EndOfFit:
+    """The fit as it is now; `begun` is the base surface in the unit of the problem."""
     here, knots = loop.current, (begun.knots_u, begun.knots_v)
     return EndOfFit(problem, surface, here.state, here.projection, order, unit, knots)
 

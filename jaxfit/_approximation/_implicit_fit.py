@@ -68,7 +68,9 @@ class FitInputs(eqx.Module):
 
 
 class EndOfFit(eqx.Module):
-    """How a fit ended, in the unit of the problem, its points indexed by `order`."""
+    """Where a fit ended, or for `UnrolledAdjoint` where it is about to begin: in the unit of the problem, its
+    points indexed by `order`.
+    """
 
     problem: Problem
     surface: WorkingSurface

@@ -32,6 +32,7 @@ from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import root_with_slope
 
 ROUNDING = 8.0  # rounding units of the sums of G: what is left of them counts as zero
 
@@ -190,6 +191,4 @@ def _sizes(
 
 def _length(x: Float[Array, "d rows width"]) -> Float[Array, "rows width"]:
     """Lengths, with the derivative 0 where they vanish."""
-    square = dot(x, x)
-    positive = square > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    return root_with_slope(dot(x, x))

@@ -133,7 +133,7 @@ def _as_often(
     step: Callable[[LoopState], LoopState],
     loop: LoopState,
 ) -> LoopState:
-    """`step` as long as the fit is `unfinished`, which is `most` times at most, with a derivative.
+    """`step` as long as the fit is `unfinished`, at most `most` times, in a loop that has a derivative.
 
     Reverse mode keeps the states that blocks of iterations begin with, and those within one block.
     """

@@ -67,6 +67,6 @@ def solve_coupled(
 
     right = jnp.where(inside, right, 0.0)
     solution = conjugate_gradients(masked, right, preconditioner, rtol, max_steps, coupled=True)
-    if unrolled():  # in reverse mode what is on the right-hand side comes in here
+    if unrolled():  # its transpose begins here, and needs a right-hand side that is masked as well
         solution = solution._replace(net=jnp.where(inside, solution.net, 0.0))
     return solution
