@@ -1,6 +1,7 @@
 """The strict session: x64 on, no silent broadcasting, shapes and dtypes checked on every call.
 
-`--float32` is the second pass: x64 off, and only the tests marked `float32_too`.
+`--slow` is the second pass: the tests marked `slow`, which are left out otherwise. `--float32` is the third:
+x64 off, and only the tests marked `float32_too`.
 """
 
 import gc
@@ -24,6 +25,7 @@ settings.load_profile("jaxfit")
 
 
 def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="run the tests marked slow, and no others")
     parser.addoption(
         "--float32",
         action="store_true",
@@ -63,9 +65,11 @@ def pytest_collection_finish(session):
 
 
 def pytest_collection_modifyitems(config, items):
-    if not config.getoption("--float32"):
-        return
-    kept = [item for item in items if item.get_closest_marker("float32_too")]
+    if config.getoption("--float32"):
+        kept = [item for item in items if item.get_closest_marker("float32_too")]
+    else:
+        wanted = config.getoption("--slow")
+        kept = [item for item in items if bool(item.get_closest_marker("slow")) == wanted]
     config.hook.pytest_deselected(items=[item for item in items if item not in kept])
     items[:] = kept
 

@@ -35,6 +35,11 @@ def diagonal(points):
     return float(np.linalg.norm(np.ptp(points.reshape(-1, points.shape[-1]), axis=0)))
 
 
+def slow_except(cases, *quick):
+    """All cases for `parametrize`, those not in `quick` marked slow."""
+    return [case if case in quick else pytest.param(case, marks=pytest.mark.slow) for case in cases]
+
+
 # ------------------------------------------------------------------ problems
 
 

@@ -30,7 +30,7 @@ def folder(tmp_path, monkeypatch):
         sides = {f"boundary_{side}": polyline for side, polyline in edges.items()}
         np.savez(tmp_path / f"{name}.npz", points=points, **sides)
     np.savez(tmp_path / "nan.npz", points=np.nan * points, **sides)
-    np.savez(tmp_path / "grid.npz", grid=wavy_grid(8, 7))
+    np.savez(tmp_path / "grid.npz", grid=wavy_grid(10, 10))  # as many: one program
     (tmp_path / "garbage.npz").write_text("no points")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
@@ -216,6 +216,7 @@ def maybe_end(job):
     return os.environ["NPROC"], job
 
 
+@pytest.mark.slow
 def test_processes_that_end_are_replaced():
     pool = Processes(2)
     found = list(

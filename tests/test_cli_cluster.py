@@ -77,6 +77,7 @@ def table(folder, output):
     return {os.path.basename(x["input"]): {k: x[k] for k in x if k not in OF_A_RUN} for x in rows}
 
 
+@pytest.mark.slow
 def test_the_table_is_the_same_where_a_worker_is_killed_half_way(folder, cluster):
     address, workers = cluster
     running = batch(folder, "out", "--scheduler", address)

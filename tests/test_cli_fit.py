@@ -94,6 +94,7 @@ def test_a_net_smaller_than_the_order_is_refused(folder, capsys):
     assert not (folder / "s.npz").exists()
 
 
+@pytest.mark.slow
 def test_the_command_stands_alone_in_single_precision(folder):
     done = command("fit", "cloud.npz", "-o", "s.npz", "--net", "6x6", "--float32", "--no-picture")
     assert done.returncode == 0, done.stderr

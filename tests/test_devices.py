@@ -12,6 +12,7 @@ from helpers import CHECKOUT
 TESTS = CHECKOUT / "tests"
 SECONDS = 600  # a machine that others use, too
 METHODS = ("geometric", "standard", "orthogonal")
+pytestmark = pytest.mark.slow
 MOST_REDUCTIONS = 3  # in an iteration
 
 

@@ -354,6 +354,7 @@ def test_an_option_that_there_is_none_gets_a_sentence():
         jf.fit_points(POINTS, BOUNDARY, tolerance=1e-4)
 
 
+@pytest.mark.slow
 def test_a_real_scan_is_fitted_from_its_boundary():
     arrays = data("igea_face")
     sides = {key[-2:]: arrays[key] for key in arrays if key.startswith("boundary_")}
@@ -364,6 +365,7 @@ def test_a_real_scan_is_fitted_from_its_boundary():
     assert np.isfinite(np.asarray(fit.surface.control_points)).all()
 
 
+@pytest.mark.slow
 def test_a_grid_taken_as_a_cloud():
     grid = data("fran_face_45x49")["grid"]
     boundary = jf.Boundary(**grid_edges(grid))

@@ -31,9 +31,9 @@ def fits(base, **options):
     "options",
     [
         {},
-        {"fairing": jf.Fairing(every=5)},
+        pytest.param({"fairing": jf.Fairing(every=5)}, marks=pytest.mark.slow),
         {"insertion": jf.KnotInsertion(every=6)},
-        {"border": jf.FixedCorners(), "relaxation": 1.7},
+        pytest.param({"border": jf.FixedCorners(), "relaxation": 1.7}, marks=pytest.mark.slow),
     ],
     ids=lambda x: "+".join(x) or "plain",
 )

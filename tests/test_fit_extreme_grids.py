@@ -112,6 +112,7 @@ def test_feet_that_keep_their_order_need_no_linear_system():
         assert (np.asarray(feet)[1:] >= middles - 1e3 * eps()).all()
 
 
+@pytest.mark.slow
 def test_derivatives_follow_feet_that_stay():
     # A grid that is symmetric to the last bit has feet on kinks.
     rng = np.random.default_rng(5)

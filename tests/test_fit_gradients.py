@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import wavy_cloud
+from helpers import slow_except, wavy_cloud
 
 import jaxfit as jf
 
@@ -81,7 +81,7 @@ def central_difference(function, arguments, place, direction, step):
     return (ends[0] - ends[1]) / (2 * step)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_except(CASES, "plate", "at given parameters"))
 def test_the_derivative_is_that_of_the_polished_fit(name):
     method, number, net, order = CASES[name]
     base = base_of(net, order)
@@ -118,17 +118,18 @@ def test_the_derivative_is_that_of_the_polished_fit(name):
 
 BASE = base_of((6, 7), (4, 4))
 # Two of the cases, whose programs are there.
-REGULAR, PLATE = (CASES[name][0](CASES[name][1]) for name in ("default", "new knots"))
+REGULAR, PLATE = (CASES[name][0](CASES[name][1]) for name in ("default", "plate"))
 
 
-def height_of(points, weights, adjoint=None, max_steps=40, method=REGULAR):
+def height_of(points, weights, adjoint=None, max_steps=40, method=PLATE):
     options = dict(tol_average=1e-12, max_steps=max_steps, weights=weights, adjoint=adjoint)
     fit = jf.approximate(points, BASE, method, **options)
     return jnp.sum(fit.surface(*PLACES) * FACTORS)
 
 
+@pytest.mark.slow
 def test_gradients_run_in_jit_and_vmap():
-    slope = jax.grad(height_of, argnums=(0, 1))
+    slope = jax.grad(partial(height_of, method=REGULAR), argnums=(0, 1))
     single = slope(POINTS, WEIGHTS)
     clouds = jnp.stack([POINTS, POINTS * 1.01])
     batch = jax.jit(jax.vmap(slope, (0, None)))(clouds, WEIGHTS)
@@ -141,7 +142,7 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
     outside = np.array([[-0.1, -0.1, 0.0], [0.5, -0.05, 0.02]])
     points = np.concatenate([POINTS[:192], special, outside, POINTS[:1], POINTS[:1]])
     weights = np.concatenate([WEIGHTS[:192], np.ones(7), [0.0]])
-    gradient = jax.grad(partial(height_of, method=PLATE), argnums=(0, 1))(points, weights)
+    gradient = jax.grad(height_of, argnums=(0, 1))(points, weights)
     assert all(np.isfinite(x).all() for x in gradient)
     direction = np.zeros(points.shape)
     direction[192:] = np.random.default_rng(0).normal(size=(8, 3))
@@ -149,7 +150,7 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
     direction[192:196] = 0.0  # on the border, where the derivative is one-sided
 
     def polished(*x):
-        return height_of(*x, adjoint=AT_ROUNDING, method=PLATE)
+        return height_of(*x, adjoint=AT_ROUNDING)
 
     difference = central_difference(polished, (points, weights), 0, direction, 1e-7)
     np.testing.assert_allclose(jnp.sum(gradient[0] * direction), difference, rtol=1e-6, atol=1e-7)
@@ -176,16 +177,21 @@ def test_a_derivative_far_from_rest_is_refused():
     np.testing.assert_allclose(slope(jf.ImplicitAdjoint()), slope(None), rtol=1e-9, atol=1e-12)
 
 
-def test_methods_that_do_not_come_to_rest_refuse_with_a_sentence():
+def test_methods_that_do_not_come_to_rest_refuse_before_they_fit():
+    steps = []
     for method in (jf.GeometricApproximation.paper(), jf.GeometricApproximation(local=True)):
+        for derivative, adjoint in ((jax.grad, None), (lambda f: f, jf.ImplicitAdjoint())):
 
-        def error(points, method=method):
-            return jf.approximate(points, BASE, method, max_steps=1).average_error
+            def error(points, method=method, adjoint=adjoint):
+                options = dict(max_steps=1, adjoint=adjoint, progress=lambda *step: steps.append(step))
+                return jf.approximate(points, BASE, method, **options).average_error
 
-        with pytest.raises(TypeError, match="has no derivative"):
-            jax.grad(error)(jnp.asarray(POINTS))
+            with pytest.raises(TypeError, match="has no derivative"):
+                derivative(error)(jnp.asarray(POINTS))
+    assert not steps
 
 
+@pytest.mark.slow
 def test_numbers_of_a_method_may_be_traced():
     @jax.jit
     def errors(relaxation, scale, reach, least):
@@ -197,6 +203,7 @@ def test_numbers_of_a_method_may_be_traced():
     assert np.isfinite(errors(1.1, 0.05, 0.5, 4.0)).all()
 
 
+@pytest.mark.slow
 def test_a_cloud_with_its_boundary_is_differentiable_in_its_points_and_weights():
     boundary = jf.Boundary(**EDGES)
 

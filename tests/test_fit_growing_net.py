@@ -36,6 +36,7 @@ def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
     assert coarse.surface.shape == (8, 8)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_points_has_no_influence(grown):
     order = np.random.default_rng(1).permutation(COUNT)
     other = jf.fit_points(CLEAN[order], BOUNDARY, tol_average=1e-4)
@@ -44,6 +45,7 @@ def test_the_order_of_the_points_has_no_influence(grown):
     assert np.abs(moved).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_hill_that_few_points_show_is_not_left_out_of_the_average():
     """With the first net the average is met, and the hill's top is 7 % of the diagonal away."""
 
@@ -60,6 +62,7 @@ def test_a_hill_that_few_points_show_is_not_left_out_of_the_average():
     assert float(fit.maximum_error) < 6e-3
 
 
+@pytest.mark.slow
 def test_single_outliers_take_no_finer_net():
     astray = CLEAN.copy()
     astray[::300, 2] += 0.1
@@ -68,6 +71,7 @@ def test_single_outliers_take_no_finer_net():
     assert float(fits[1].maximum_error) > 0.03
 
 
+@pytest.mark.slow
 def test_noise_ends_the_growth_and_is_not_followed():
     size, noise = diagonal(CLEAN), 0.01
     noisy = CLEAN + noise * size / np.sqrt(3) * np.random.default_rng(2).normal(size=CLEAN.shape)
@@ -82,6 +86,7 @@ def test_noise_ends_the_growth_and_is_not_followed():
     assert away < 0.4 * noise
 
 
+@pytest.mark.slow
 def test_a_tolerance_that_the_points_do_not_carry_is_reported():
     few = CLEAN[:520]
     fit = jf.fit_points(few, BOUNDARY, tol_average=1e-9, tol_maximum=1e-9)
@@ -91,6 +96,7 @@ def test_a_tolerance_that_the_points_do_not_carry_is_reported():
         jf.fit_points(few, BOUNDARY, tol_average=1e-9, max_steps=1, throw=True)
 
 
+@pytest.mark.slow
 def test_few_points_and_other_wishes_keep_one_net():
     few = jf.fit_points(CLEAN[:400], BOUNDARY, tol_average=1e-3, max_steps=5)
     assert few.surface.shape == (8, 8)
@@ -99,6 +105,7 @@ def test_few_points_and_other_wishes_keep_one_net():
     assert jf.fit_points(CLEAN, BOUNDARY, tol_average=None, max_steps=1).surface.shape == (20, 19)
 
 
+@pytest.mark.slow
 def test_points_of_weight_zero_choose_no_net():
     # So few that they share the programs of the other fits.
     astray = np.concatenate([CLEAN, CLEAN[::42] + np.array([[0.0, 0.0, 0.5]])])

@@ -135,6 +135,7 @@ def objective(fit, surface, errors):
     return np.sum((np.asarray(errors) * float(fit.stats["diagonal"])) ** 2) + bending
 
 
+@pytest.mark.slow
 def test_optimistix_comes_to_the_same_minimum(base):
     nearest = jf.closest_point(base, POINTS)
     feet = (nearest.u, nearest.v)

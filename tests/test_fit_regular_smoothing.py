@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import clamped_uniform, data, diagonal, grid_edges, wavy_cloud, wavy_net
+from helpers import clamped_uniform, data, diagonal, grid_edges, slow_except, wavy_cloud, wavy_net
 
 import jaxfit as jf
 from jaxfit._approximation._folds import folds_by_cell, near_folds
@@ -31,6 +31,7 @@ def base():
     return jf.base_surface(jf.Boundary(**grid_edges(grid)), net=(14, 14))
 
 
+@pytest.mark.slow
 def test_points_beyond_a_held_border_are_told_and_met_with_a_free_one():
     points, edges = wavy_cloud(200)
     middle = points.mean(axis=0)
@@ -46,6 +47,7 @@ def test_points_beyond_a_held_border_are_told_and_met_with_a_free_one():
     assert free.average_error < 0.1 * held.average_error
 
 
+@pytest.mark.slow
 def test_a_pocket_under_the_sheet_makes_no_fold_and_is_out_of_reach(base):
     points, bowl = pocketed()
     fit = jf.approximate(points, base, tol_average=1e-6, max_steps=60)
@@ -57,6 +59,7 @@ def test_a_pocket_under_the_sheet_makes_no_fold_and_is_out_of_reach(base):
     assert jf.approximate(points, base, plate, tol_average=1e-6, max_steps=60).regularity.folds > 20
 
 
+@pytest.mark.slow
 def test_noise_is_not_fitted(base):
     clean = sheet(*np.random.default_rng(1).uniform(size=(2, 1500)))
     noisy = clean + 0.01 * np.random.default_rng(2).normal(size=clean.shape)
@@ -138,7 +141,7 @@ def test_impossible_fields_get_a_sentence(fields, sentence):
         jf.RegularSmoothing(**fields)
 
 
-@pytest.mark.parametrize("border", [jf.FixedBorder(), jf.FreeBorder()])
+@pytest.mark.parametrize("border", slow_except([jf.FixedBorder(), jf.FreeBorder()], jf.FixedBorder()))
 def test_room_for_new_knots_changes_no_fit_before_they_are_there(border):
     points, edges = wavy_cloud(200)
     base = jf.base_surface(jf.Boundary(**edges), net=(7, 6))

@@ -43,6 +43,7 @@ def test_a_region_without_points_stays_near_the_base_without_smoothing(method):
     assert np.abs(fit.surface.control_points).max() < 20
 
 
+@pytest.mark.slow
 def test_all_ways_to_solve_leave_the_same_control_points_alone():
     points = cloud(400)
     points = points[~((points[:, 0] > 0.5) & (points[:, 1] > 0.5))]

@@ -35,7 +35,7 @@ EVERY_CHOICE = jf.GeometricInterpolation(
 
 @pytest.mark.parametrize(
     ("method", "order"),
-    [(jf.GeometricInterpolation(), (3, 5)), (EVERY_CHOICE, (4, 4))],
+    [(jf.GeometricInterpolation(), (3, 5)), pytest.param(EVERY_CHOICE, (4, 4), marks=pytest.mark.slow)],
     ids=["usual", "every"],
 )
 def test_derivatives_are_those_of_finite_differences(method, order):

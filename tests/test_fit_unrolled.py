@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow_except
 
 import jaxfit as jf
 
@@ -60,7 +61,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", slow_except(METHODS, "standard"))
 def test_reverse_and_forward_mode_agree_with_central_differences(name):
     def of(inputs):
         return few_steps(inputs["points"], base(), METHODS[name], weights=inputs["weights"])
@@ -85,7 +86,7 @@ FORWARD = {
 }
 
 
-@pytest.mark.parametrize("name", FORWARD)
+@pytest.mark.parametrize("name", slow_except(FORWARD, "free border"))
 def test_derivatives_follow_new_knots_fairing_and_a_free_border(name):
     points = jnp.asarray(cloud())
     d = directions(points)
@@ -119,6 +120,7 @@ def test_a_weight_of_zero_has_the_derivative_to_the_right():
     assert float(jax.grad(of)(jnp.asarray(0.0))) == pytest.approx(right, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_fit_that_converges_before_its_last_step_is_followed_as_far_as_it_went():
     surface, method = base(), jf.GeometricApproximation()
     goals = {"tol_average": 6e-3, "tol_maximum": None}
@@ -134,6 +136,7 @@ def test_a_fit_that_converges_before_its_last_step_is_followed_as_far_as_it_went
     assert inner(jax.jit(jax.grad(of))(points), d) == pytest.approx(slope(of, points, d), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_has_the_derivatives_of_its_clouds():
     both = jnp.stack([jnp.asarray(cloud()), 1.1 * jnp.asarray(cloud())])
     gradient = jax.grad(lambda p: few_steps(p, base(), jf.GeometricApproximation()))
@@ -142,9 +145,11 @@ def test_a_batch_has_the_derivatives_of_its_clouds():
         np.testing.assert_allclose(found, gradient(points), rtol=1e-8, atol=1e-10)
 
 
-def test_the_fit_differs_little_from_one_without_a_derivative():
+@pytest.mark.parametrize("name", slow_except(METHODS, "standard"))
+def test_the_fit_differs_little_from_one_without_a_derivative(name):
+    options = {"tol_average": None, "tol_maximum": 1e-9, "max_steps": 4}
     plain, followed = (
-        jf.approximate(cloud(), base(), tol_average=None, tol_maximum=1e-9, max_steps=4, adjoint=adjoint)
+        jf.approximate(cloud(), base(), METHODS[name], adjoint=adjoint, **options)
         for adjoint in (None, UNROLLED)
     )
     assert float(followed.average_error) == pytest.approx(float(plain.average_error), rel=1e-3)

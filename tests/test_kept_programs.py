@@ -21,6 +21,7 @@ def grid(tmp_path, monkeypatch):
     return ("fit", "grid.npz", "-o", "s.npz", "--no-picture")
 
 
+@pytest.mark.slow
 def test_a_second_run_compiles_nothing_anew(grid, tmp_path):
     home = {"XDG_CACHE_HOME": str(tmp_path / "c"), "HOME": str(tmp_path), "LOCALAPPDATA": str(tmp_path / "c")}
     kept = []
@@ -239,6 +240,7 @@ print(repr(float(np.sum(fit.surface.control_points))))
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_no_fit(tmp_path):
     np.save(tmp_path / "grid.npy", wavy_grid(8, 7))
     printed = [

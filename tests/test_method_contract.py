@@ -104,6 +104,7 @@ def test_it_runs_in_jit_and_vmap(base, fit):
     assert np.abs(np.asarray(batch[1] - jax.jit(net)(jnp.asarray(POINTS) + 0.01))).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_its_iterations_have_a_derivative(base):
     def corner(points):
         fit = jf.approximate(points, base, HeavyBall(), max_steps=3, adjoint=jf.UnrolledAdjoint())

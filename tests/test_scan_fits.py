@@ -5,7 +5,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from helpers import data, diagonal
+from helpers import data, diagonal, slow_except
 
 import jaxfit as jf
 from jaxfit._scan import is_nodata
@@ -115,6 +115,7 @@ def test_the_ends_of_a_scroll_are_fitted_as_well():
     assert fit.maximum_error < 0.007
 
 
+@pytest.mark.slow
 def test_noise_makes_no_sheet_larger(fit):
     points = scan()
     points[:, 2] += np.random.default_rng(1).normal(0, 0.008, len(points))
@@ -124,7 +125,7 @@ def test_noise_makes_no_sheet_larger(fit):
     assert np.isclose(area, float(fit.trimmed.area()), rtol=0.03)
 
 
-@pytest.mark.parametrize("spacings", [0.35, 1.0])
+@pytest.mark.parametrize("spacings", slow_except([0.35, 1.0], 1.0))
 def test_noise_as_large_as_the_spacing_tears_no_sheet(spacings):
     half, count = np.pi, 1600
     angle, height = (np.arange(count)[:, None] / [1.3247179572, 1.3247179572**2] % 1).T * [[half], [2.0]]
@@ -154,6 +155,7 @@ def test_a_longer_hole_length_closes_the_hole():
     assert fit.stats["hole_length"] == pytest.approx(0.6)
 
 
+@pytest.mark.slow
 def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
     points = data("deepdrawing_cup")["points"]
     fit = jf.fit_points(points, net=(33, 33))

@@ -28,7 +28,8 @@ def interpolated(grid):
 
 
 def fitted(points):
-    fit = jf.approximate(points, SURFACE, jf.StandardApproximation(1e-3), tol_average=1e-9)
+    method = jf.StandardApproximation(1e-3, parameter_correction=False)
+    fit = jf.approximate(points, SURFACE, method, tol_average=1e-9)
     return jnp.sum(fit.surface.control_points)
 
 

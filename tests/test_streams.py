@@ -6,7 +6,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
-from helpers import count_compilations, eps, wavy_cloud
+from helpers import count_compilations, eps, slow_except, wavy_cloud
 
 import jaxfit as jf
 
@@ -51,7 +51,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", slow_except(METHODS, "standard", "single steps"))
 def test_a_fit_in_blocks_is_the_fit_in_memory(base, name):
     method = METHODS[name]
     if name == "paper":  # in memory feet start ahead: the tolerance of feet is what both share

@@ -209,6 +209,7 @@ def test_triangles_fill_the_loops_and_keep_to_the_surface(which):
     assert area.sum() == pytest.approx(float(trimmed.area()), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_finer_triangles_come_closer_to_the_area():
     trimmed = jf.TrimmedSurface(wavy_surface(9, 8), (SQUARE, *HOLES))
     errors = []

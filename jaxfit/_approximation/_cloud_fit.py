@@ -72,10 +72,7 @@ def fit_cloud(
     begun = working_surface(base, unit, concrete)
     if room is not None:
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
-    if feet is None:
-        nearest = closest_point(base, cloud)
-        feet = nearest.u, nearest.v
-    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet)
+    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud))
     order = order_by_cell(begun, u, v, cloud.shape[0])
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
@@ -84,6 +81,8 @@ def fit_cloud(
     entries = max_steps if room is None else room.steps
     loop = begin(method, together, begun, u[order], v[order], entries)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
+    if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
+        _check_derivative(method, together, loop)
     if unrolled:
         first = _end(together, begun, loop, order, unit, begun)
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
@@ -107,6 +106,18 @@ def fit_cloud(
     }
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
+
+
+def _nearest(base: BSplineSurface, cloud: Any) -> tuple[Any, Any]:
+    """The parameters of the closest points."""
+    nearest = closest_point(base, cloud)
+    return nearest.u, nearest.v
+
+
+def _check_derivative(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> None:
+    """Have a method that has no implicit derivative say so before the fit, which may take long."""
+    here = loop.current
+    jax.eval_shape(method.stationarity, problem, here.surface, here.state, here.projection.error)
 
 
 def _end(
