@@ -20,7 +20,7 @@ jax.config.update("jax_enable_x64", True)
 
 SUITES = {
     "paper": "Tables 1 to 5 and Figures 1, 2, 4b, 7, 8 and 10 of the paper",
-    "peers": "beside SciPy, CHOLMOD, geomdl, splinepy, splipy and Open CASCADE, on the same arrays",
+    "peers": "beside SciPy, CHOLMOD, geomdl, splinepy, splipy, G+Smo and Open CASCADE, on the same arrays",
     "scaling": "time of a pass and error by the number of points and of control points",
     "compile": "first and later calls, each in a process of its own",
     "gradients": "time of a gradient beside the fit, and beside central differences",

@@ -10,8 +10,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-PACKAGES = "jaxfit-surfaces jax jaxlib numpy scipy geomdl splinepy splipy cvxopt scikit-sparse".split()
-PACKAGES += ["cadquery-ocp-novtk"]
+PACKAGES = "jaxfit-surfaces jax jaxlib numpy scipy geomdl splinepy splipy pygismo cvxopt".split()
+PACKAGES += ["scikit-sparse", "cadquery-ocp-novtk"]
 
 
 def version(package):

@@ -2,7 +2,7 @@
 
 SciPy and splipy get the parameters and knots that jaxfit chose, for nothing; ours include making them, the
 checks and the errors. splinepy, geomdl and Open CASCADE choose their own. A peer that is not installed is
-named.
+named. interpax is none: it interpolates values at query points and makes no surface.
 """
 
 import importlib
@@ -144,8 +144,11 @@ def least_squares(report, options):
             "jaxfit": lambda a=(knots, u, v, points): _our_solve(*a),
             f"SciPy + {name}": lambda a=(knots, (nu, nv), u, v, points): _sparse_solve(solve, *a),
         }
+        if gismo := installed(report, "pygismo"):
+            works["G+Smo (pygismo)"] = lambda a=(gismo[0], knots, u, v, points): _gismo_solve(*a)
         done = in_turns(works, options.runs)
-        apart = np.abs(np.subtract(*(x.result for x in done.values()))).max() / _inputs.diagonal(points)
+        nets = [x.result for x in done.values()]
+        apart = max(np.abs(net - nets[0]).max() for net in nets) / _inputs.diagonal(points)
         cells = lambda net, k=knots, p=points: judged(net, k, p)  # noqa: E731
         ratios(report, done, cells, points=f"{count}", net=f"{nu}x{nv}")
         report.remark(f"largest difference of a control point: {apart:.1e} of the diagonal")
@@ -164,6 +167,16 @@ def _our_solve(knots, u, v, points):
 def _sparse_solve(solve, knots, shape, u, v, points):
     a = NdBSpline.design_matrix(np.stack([u, v], axis=-1), knots, 3)
     return solve((a.T @ a).tocsc(), a.T @ points).reshape(*shape, 3)
+
+
+def _gismo_solve(gismo, knots, u, v, points):
+    bases = (gismo.nurbs.gsKnotVector(k.tolist(), 3) for k in knots)
+    basis = gismo.nurbs.gsTensorBSplineBasis2(*bases)
+    fit = gismo.modelling.gsFitting(np.stack([u, v]), np.ascontiguousarray(points.T), basis)
+    fit.compute(0.0)
+    surface = fit.result()  # lives as long as its coefficients are read; its first index runs fastest
+    net = np.array(surface.coefs())
+    return net.reshape(*(len(k) - 4 for k in reversed(knots)), 3).swapaxes(0, 1)
 
 
 def _cholesky():

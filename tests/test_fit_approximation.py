@@ -137,6 +137,7 @@ def test_fairing_comes_every_so_many_iterations(base):
     assert (np.flatnonzero(np.diff(average) > 0) + 1).tolist() == [5, 10]
 
 
+@pytest.mark.slow
 def test_fairing_a_good_base_surface_is_no_stall(base):
     near = jf.approximate(POINTS, base, tol_average=1e-9, max_steps=100).surface
     method = plain(fairing=jf.Fairing(every=5), stall_window=10)

@@ -32,7 +32,7 @@ def fits(base, **options):
     [
         {},
         pytest.param({"fairing": jf.Fairing(every=5)}, marks=pytest.mark.slow),
-        {"insertion": jf.KnotInsertion(every=6)},
+        pytest.param({"insertion": jf.KnotInsertion(every=6)}, marks=pytest.mark.slow),
         pytest.param({"border": jf.FixedCorners(), "relaxation": 1.7}, marks=pytest.mark.slow),
     ],
     ids=lambda x: "+".join(x) or "plain",

@@ -60,6 +60,7 @@ def test_an_extreme_grid_is_met_in_at_most_200_iterations(name):
     assert np.abs(np.asarray(fit.surface.control_points - standard.control_points)).max() <= 1e3 * eps()
 
 
+@pytest.mark.slow
 def test_without_the_linear_system_it_says_that_it_has_stalled():
     grid = fuselage(41)
     for fit in (jf.interpolate(grid, STALLING), jax.jit(jf.interpolate)(grid)):

@@ -81,7 +81,7 @@ def central_difference(function, arguments, place, direction, step):
     return (ends[0] - ends[1]) / (2 * step)
 
 
-@pytest.mark.parametrize("name", slow_except(CASES, "plate", "at given parameters"))
+@pytest.mark.parametrize("name", slow_except(CASES, "at given parameters"))
 def test_the_derivative_is_that_of_the_polished_fit(name):
     method, number, net, order = CASES[name]
     base = base_of(net, order)

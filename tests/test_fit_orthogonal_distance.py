@@ -210,6 +210,7 @@ def test_moves_reach_no_farther_than_a_share_of_the_spacing():
     assert (cut[3, 3] == 1e-3).all()
 
 
+@pytest.mark.slow
 def test_a_spline_surface_is_found_again_without_its_parameters():
     got = data("bspline_reference")
     net, size = got["control_points"], diagonal(got["points"])
@@ -232,6 +233,7 @@ def test_a_tolerance_is_reached_in_few_steps(base):
     assert np.abs(np.asarray(fit.errors) - distance).max() < 100 * eps() + 1e-9
 
 
+@pytest.mark.slow
 def test_new_knots_go_in_while_it_runs(base):
     insertion = jf.KnotInsertion(every=2, most=3)
     method = jf.OrthogonalDistance(smoothing=2e-12, insertion=insertion)

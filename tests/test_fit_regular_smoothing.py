@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import clamped_uniform, data, diagonal, grid_edges, slow_except, wavy_cloud, wavy_net
+from helpers import clamped_uniform, data, diagonal, grid_edges, wavy_cloud, wavy_net
 
 import jaxfit as jf
 from jaxfit._approximation._folds import folds_by_cell, near_folds
@@ -141,7 +141,8 @@ def test_impossible_fields_get_a_sentence(fields, sentence):
         jf.RegularSmoothing(**fields)
 
 
-@pytest.mark.parametrize("border", slow_except([jf.FixedBorder(), jf.FreeBorder()], jf.FixedBorder()))
+@pytest.mark.slow
+@pytest.mark.parametrize("border", [jf.FixedBorder(), jf.FreeBorder()])
 def test_room_for_new_knots_changes_no_fit_before_they_are_there(border):
     points, edges = wavy_cloud(200)
     base = jf.base_surface(jf.Boundary(**edges), net=(7, 6))

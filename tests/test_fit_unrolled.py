@@ -95,6 +95,7 @@ def test_derivatives_follow_new_knots_fairing_and_a_free_border(name):
     )
 
 
+@pytest.mark.slow
 def test_numbers_base_and_start_have_derivatives():
     surface = base()
 
@@ -111,6 +112,7 @@ def test_numbers_base_and_start_have_derivatives():
     assert inner(gradient, d) == pytest.approx(slope(of, x, d), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_weight_of_zero_has_the_derivative_to_the_right():
     def of(weight):
         weights = jnp.ones(POINTS_AT.shape[1]).at[7].set(weight)

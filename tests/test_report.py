@@ -59,6 +59,7 @@ def fitted():
     return points, jf.fit_points(points, jf.Boundary(**edges), net=(6, 6), max_steps=3)
 
 
+@pytest.mark.slow
 def test_a_trimmed_fit_has_a_page_with_all_pictures(tmp_path):
     points, fit = fitted()
     fit = dataclasses.replace(fit, trimmed=jf.TrimmedSurface(fit.surface, LOOPS["an L with two holes"]))

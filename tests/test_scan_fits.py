@@ -5,7 +5,7 @@ import sys
 import jax
 import numpy as np
 import pytest
-from helpers import data, diagonal, slow_except
+from helpers import data, diagonal
 
 import jaxfit as jf
 from jaxfit._scan import is_nodata
@@ -108,6 +108,7 @@ def test_a_height_that_looks_like_no_data_among_others_is_data():
         assert not is_nodata(np.stack([x, y, heights], axis=1)).any()
 
 
+@pytest.mark.slow
 def test_the_ends_of_a_scroll_are_fitted_as_well():
     angle, across = np.random.default_rng(0).uniform([[1.5 * np.pi], [0]], [[3 * np.pi], [10]], (2, 3000))
     fit = jf.fit_points(np.stack([angle * np.cos(angle), across, angle * np.sin(angle)], axis=1), net=(24, 8))
@@ -125,7 +126,8 @@ def test_noise_makes_no_sheet_larger(fit):
     assert np.isclose(area, float(fit.trimmed.area()), rtol=0.03)
 
 
-@pytest.mark.parametrize("spacings", slow_except([0.35, 1.0], 1.0))
+@pytest.mark.slow
+@pytest.mark.parametrize("spacings", [0.35, 1.0])
 def test_noise_as_large_as_the_spacing_tears_no_sheet(spacings):
     half, count = np.pi, 1600
     angle, height = (np.arange(count)[:, None] / [1.3247179572, 1.3247179572**2] % 1).T * [[half], [2.0]]

@@ -42,7 +42,7 @@ CASES = {
 HOW = {"grad": jax.grad, "vmap": lambda function: lambda x: jax.vmap(function)(jnp.stack([x, x]))}
 
 
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("how", helpers.slow_except(HOW, "grad"))
 @pytest.mark.parametrize("name", CASES)
 def test_a_second_one_compiles_nothing(name, how):
     function, argument = CASES[name]
