@@ -31,11 +31,12 @@ def gauss_newton_step(
     held: Bool[Array, "nu nv"],
     longest: Float[Array, "nu nv"],
     damping: Float[Array, ""],
+    second_order: Bool[Array, ""],
 ) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
     """The net after the step, and the predicted reduction of the objective.
 
-    `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move. At
-    damping 1 there is none, and moves may be longer than `longest`.
+    `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move; only
+    steps of `second_order` have one. At damping 1 moves may be longer than `longest`.
     """
     stiffness, bent = penalty.system(net)
     matrix = equations.matrix.plus(stiffness)
@@ -47,7 +48,7 @@ def gauss_newton_step(
     # geometric mean serve both.
     between = data.times(jnp.sqrt(damping)).plus(stiffness)
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
-    corrected = damping < 1
+    damped = damping < 1
     most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
     def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
@@ -55,16 +56,16 @@ def gauss_newton_step(
         rhs = lax.cond(
             is_step,
             lambda: right,
-            lambda: lax.cond(corrected, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
+            lambda: lax.cond(second_order, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
         )
         solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, most).net
-        limited = jnp.where(corrected, within_reach(solution, longest), solution)
+        limited = jnp.where(damped, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 
     move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
     whole = within_reach(move + _at_most(LARGEST_CORRECTION, correction, move), longest)
-    return net + jnp.where(corrected, whole, move), predicted
+    return net + jnp.where(damped, whole, move), predicted
 
 
 def _at_most(share: float, correction: Array, move: Array) -> Array:

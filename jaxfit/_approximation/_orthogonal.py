@@ -95,7 +95,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     Where the net slides along the surface the distances change to second order only. So each step gets a
     correction (geodesic acceleration): the solution of the same system for the second derivatives of the
-    residuals along the step, at the same feet and at most 0.75 times as long as the step.
+    residuals along the step, at the same feet and at most 0.75 times as long as the step. While the weight of
+    `RegularSmoothing` still fades everywhere there is none: the next step has another objective anyway.
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1. After it mu
@@ -292,7 +293,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
             return gauss_newton_step(penalty, correction_rhs, *x)
 
         longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
-        following, predicted = materialise(always, solve, penalty, equations, net, held, longest, damping)
+        second_order = damping < 1
+        if guard is not None:
+            second_order &= self.smoothing.has_faded(guard)
+        args = (penalty, equations, net, held, longest, damping, second_order)
+        following, predicted = materialise(always, solve, *args)
         lost = jnp.isnan(state.smoothing)  # a traced lambda that is none
         following = jnp.where(lost, jnp.nan, following)
         damped = DampingState(surface, predicted, damping, state.damping.rejected_steps)

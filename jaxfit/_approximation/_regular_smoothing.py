@@ -152,6 +152,10 @@ class RegularSmoothing(eqx.Module):
         least = jnp.full_like(guard.factor, self.least)
         return FoldGuard(least, least, *(jnp.zeros_like(least),) * 2, guard.folds).seeing(surface)
 
+    def has_faded(self, guard: "FoldGuard") -> Bool[Array, ""]:
+        """Whether the factor of some control point has fallen to `least`."""
+        return jnp.min(jnp.asarray(guard.factor)) <= self.least
+
     def following_least(self, guard: "FoldGuard") -> "FoldGuard":
         """With factors that have fallen to `least` as functions of it, for derivatives."""
         factor = jnp.where(guard.factor <= jax.lax.stop_gradient(self.least), self.least, guard.factor)
