@@ -13,6 +13,6 @@ PARTS = {
     "table4": paper_clouds.table_4,
     "table5": paper_clouds.table_5,
     "figure4b": paper_clouds.figure_4b,
-    "figure7": paper_clouds.figure_7,
+    "figure7": paper_grids.figure_7,
     "figures8and10": paper_clouds.figures_8_and_10,
 }

@@ -1,4 +1,4 @@
-"""Tables 4 and 5 and Figures 4b, 7, 8 and 10 of the paper: approximation of scattered points."""
+"""Tables 4 and 5 and Figures 4b, 8 and 10 of the paper: approximation of scattered points."""
 
 import functools
 
@@ -22,7 +22,6 @@ PRINTED, DEFAULT, STANDARD, ORTHOGONAL = (
     "standard",
     "orthogonal distance",
 )
-LEVELS = (3, 2, 1.5, 1)  # times the target of Table 5
 
 
 def methods(smoothing):
@@ -111,24 +110,6 @@ def _variation(surface, size, count=300):
     at = (np.arange(count) + 0.5) / count
     mean = size * np.asarray(surface.curvature(*np.meshgrid(at, at, indexing="ij")).mean)
     return float(sum(np.abs(np.diff(mean, axis=axis)).sum() / count for axis in (0, 1)))
-
-
-def figure_7(report, options):
-    """Seconds to fall to an average error, two sizes of cloud."""
-    report.table(
-        "Figure 7: time against average error", "Seconds of a second call, by target; - where it is missed."
-    )
-    for cloud, base in prepared(options.stand_ins, options.quick)[-2:]:
-        for name, method in methods(cloud.smoothing).items():
-            cells = {}
-            for level in LEVELS:
-                target = level * cloud.target
-                work = functools.partial(jf.approximate, cloud.points, base, method, tol_average=target)
-                found = timed(work, 1)
-                cells[f"{level:g} x target"] = found.median if bool(found.result.converged) else float("nan")
-            report.row(
-                model=cloud.role, method=name, points=len(cloud.points), target=100 * cloud.target, **cells
-            )
 
 
 def figures_8_and_10(report, options):

@@ -96,7 +96,8 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        print_table({**read_from, "tolerances": done.tolerances, **facts(done.fit), **outcome})
+        found = facts(done.fit) | {"tolerances": done.tolerances}
+        print_table({**read_from, "tolerances": "", **found, **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 

@@ -33,6 +33,7 @@ exit codes:
 
 environment:
   JAXFIT_CACHE_DIR  as --cache; empty or "off" is --no-cache
+  JAXFIT_PROGRESS   "off" shows no progress
 
 All errors are distances from the data to the surface, in % of the diagonal of the data's
 bounding box.

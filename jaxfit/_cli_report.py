@@ -5,6 +5,8 @@ import importlib.util
 import re
 from collections.abc import Callable, Iterator, Mapping
 
+from jaxfit._progress_line import is_switched_off
+
 Progress = Callable[[int, int, float, float], None]
 
 # Options that sentences of the library name as in Python; not as a part of a file's name.
@@ -39,7 +41,7 @@ def print_table(rows: Mapping[str, str]) -> None:
 @contextlib.contextmanager
 def progress_bar(show: bool) -> Iterator[Progress | None]:
     """A bar on stderr while the block runs; yields what a fit takes as `progress`, or None."""
-    if not show or importlib.util.find_spec("rich") is None:
+    if not show or is_switched_off() or importlib.util.find_spec("rich") is None:
         yield None
         return
     from rich import progress

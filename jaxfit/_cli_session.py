@@ -8,7 +8,7 @@ import sys
 import jax
 
 from jaxfit._program_folder import VARIABLE, keep_programs
-from jaxfit._progress_line import SETTING
+from jaxfit._progress_line import BAR, SETTING, is_switched_off
 
 
 def choose_precision(args: argparse.Namespace) -> None:
@@ -25,7 +25,8 @@ def trace_quickly() -> None:
 
 def show_no_line() -> None:
     """Have fits, those of worker processes too, show no line of their own beside the command's bar."""
-    os.environ[SETTING] = "off"
+    if not is_switched_off():
+        os.environ[SETTING] = BAR
 
 
 def set_compile_cache(args: argparse.Namespace) -> None:

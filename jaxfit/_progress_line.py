@@ -17,6 +17,7 @@ from typing import Any
 from jaxfit._checks import is_concrete
 
 SETTING = "JAXFIT_PROGRESS"  # "off" in the environment shows nothing
+OFF, BAR = "off", "bar"  # the latter where the command shows a bar of its own
 DELAY = 3.0  # seconds before the line appears
 INTERVAL = 0.25  # between two updates
 COMPILER = "backend_compile"  # begins or is within the name of JAX's function that waits for XLA
@@ -89,8 +90,13 @@ def _line_of(phase: str) -> Iterator[None]:
         _one_line.release()
 
 
+def is_switched_off() -> bool:
+    """Whether the environment asks for no progress."""
+    return os.environ.get(SETTING, "").lower() == OFF
+
+
 def _is_watched() -> bool:
-    if os.environ.get(SETTING, "").lower() == "off" or multiprocessing.parent_process():
+    if is_switched_off() or os.environ.get(SETTING) == BAR or multiprocessing.parent_process():
         return False
     return _in_notebook() or bool(getattr(sys.stderr, "isatty", bool)())
 

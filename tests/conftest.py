@@ -47,7 +47,7 @@ def compile_quickly():
 
 
 def pytest_configure(config):
-    # The second pass runs the code that users get.
+    # The pass in single precision runs the code that users get.
     if not config.getoption("--float32") and not hasattr(config, "workerinput"):
         compile_quickly()
     jax.config.update("jax_enable_x64", not config.getoption("--float32"))

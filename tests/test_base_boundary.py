@@ -44,7 +44,7 @@ def test_consecutive_duplicates_are_dropped_and_both_ends_stay():
 def test_a_gap_is_reported_with_its_place_and_size():
     sides = square()
     sides["u1"] = sides["u1"] + np.array([0.0, 0.0, 0.5])
-    sentence = r"end of v0 and the start of u1 are 0.5 apart \(24 % .*share their corner points"
+    sentence = r"end of v0 and the start of u1 are 0.5 apart \(24.3 % .*share their corner points"
     with pytest.raises(ValueError, match=sentence):
         Boundary(**sides)
 
@@ -56,6 +56,12 @@ def test_a_reversed_polyline_is_named(turned):
         sides[name] = sides[name][::-1]
     with pytest.raises(ValueError, match=f"reverse {' and '.join(turned)}"):
         Boundary(**sides)
+
+
+def test_sides_in_the_order_of_a_walk_round_the_patch_are_told_the_right_order():
+    v0, v1, u0, u1 = square().values()
+    with pytest.raises(ValueError, match=r"\(100 % .*give them as Boundary\(v0, v1, u0, u1\)"):
+        Boundary(v0, u1, v1[::-1], u0[::-1], tolerance=0.1)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Pictures show the whole surface and every error, and leave Matplotlib's global state alone."""
 
+import inspect
 import sys
 import time
 from types import SimpleNamespace
@@ -21,6 +22,12 @@ pytest.importorskip("matplotlib")
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr("jaxfit.plot._render._PIXELS", 400)
+
+
+def test_a_path_in_the_place_of_points_is_told():
+    picture = inspect.unwrap(surface_and_errors)  # as users have it, without checks of annotations
+    with pytest.raises(TypeError, match=r"points must be an array.*path='errors\.png'"):
+        picture(fake_fit((40,)), "errors.png")
 
 
 def fake_fit(shape, surface=None, seed=0):

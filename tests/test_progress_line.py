@@ -14,6 +14,7 @@ from helpers import wavy_cloud
 
 import jaxfit as jf
 from jaxfit import _progress_line
+from jaxfit._cli_report import progress_bar
 
 
 class Terminal(io.StringIO):
@@ -89,6 +90,8 @@ def test_nothing_is_started_where_nothing_is_to_be_shown(shown, monkeypatch):
     assert shown(traced) == ""
     monkeypatch.setenv(_progress_line.SETTING, "off")
     assert shown(wait) == ""
+    with progress_bar(show=True) as report:  # of the command
+        assert report is None
 
 
 def test_short_work_shows_nothing(shown, monkeypatch):

@@ -179,10 +179,10 @@ def test_a_fit_tells_its_loops_and_the_errors_inside():
     assert fit.trimmed is None
     assert np.asarray(fit.inside).all()
     trimmed = jf.TrimmedSurface(fit.surface, LOOPS["an L with two holes"])
-    fit = dataclasses.replace(fit, trimmed=trimmed)
+    fit = dataclasses.replace(fit, trimmed=trimmed, stats={**fit.stats, "hole_length": 0.25})
     said = str(fit)
     assert fit.message == "all tolerances are met."
-    assert "the outer one with 6 vertices, 2 holes" in said
+    assert "the outer one with 6 vertices, 2 holes (gaps wider than 0.25, the hole length)" in said
     assert f"{int(np.asarray(fit.inside).sum())} of 56 points, average error" in said
 
 

@@ -61,9 +61,9 @@ def check_options(
     if adjoint is not None:
         check_kind("adjoint", adjoint, AbstractAdjoint, "ImplicitAdjoint()")
     check_steps("max_steps", max_steps)
-    for tolerance in (tol_average, tol_maximum):
+    for name, tolerance in (("tol_average", tol_average), ("tol_maximum", tol_maximum)):
         if tolerance is not None and is_concrete(tolerance):
-            check_number("tol_average and tol_maximum", tolerance, 0.0)
+            check_number(name, tolerance, 0.0)
     if progress is not None and not callable(progress):
         raise TypeError(
             f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "

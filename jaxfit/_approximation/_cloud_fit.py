@@ -100,6 +100,8 @@ def fit_cloud(
     stats = {
         "method": Name(type(method).__name__),
         "num_steps": loop.current.step,
+        "tol_average": tolerances.average,
+        "tol_maximum": tolerances.maximum,
         "diagonal": unit.diagonal,
         "unconverged_feet": _sum(~parts[3]),
         **stats,

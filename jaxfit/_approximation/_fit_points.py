@@ -80,8 +80,9 @@ def fit_points(
         boundary. Default: twice the distance of the sixth neighbour, of 99 % of the points; given faces are
         all kept.
     method, options
-        As for `approximate`: tol_average, tol_maximum, max_steps, weights, start, progress, throw, errors,
-        adjoint. Without a boundary there are no `start` and no `adjoint`.
+        As for `approximate`: tol_average (default 6e-4) and tol_maximum (default none), fractions of the
+        diagonal: 6e-4 is 0.06 %; max_steps, weights, start, progress, throw, errors, adjoint. Without a
+        boundary there are no `start` and no `adjoint`.
 
     Returns
     -------

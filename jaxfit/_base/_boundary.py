@@ -1,6 +1,6 @@
 """The four boundary polylines of a patch, checked and with common corners."""
 
-from itertools import product
+from itertools import permutations, product
 from typing import Any
 
 import equinox as eqx
@@ -165,14 +165,23 @@ def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) ->
     raise ValueError(
         f"boundary corners do not meet: the {'start' if v_end == 0 else 'end'} of {v} and the "
         f"{'start' if u_end == 0 else 'end'} of {u} are {gaps[worst]:.3g} apart "
-        f"({100 * gaps[worst] / size:.2g} % of the diagonal); {_remedy(lines, allowed)}."
+        f"({100 * gaps[worst] / size:.3g} % of the diagonal); {_remedy(lines, allowed)}."
     )
 
 
 def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
-    for flips in sorted(product((1, -1), repeat=4), reverse=True):
-        reversed_lines = {n: x[::f] for (n, x), f in zip(lines.items(), flips, strict=True)}
-        if max(_corner_gaps(reversed_lines)) <= allowed:
-            names = [n for n, f in zip(lines, flips, strict=True) if f < 0]
-            return f"reverse {' and '.join(names)}"
+    if turned := _to_reverse(lines, allowed):
+        return f"reverse {' and '.join(turned)}"
+    for others in permutations(lines.values()):
+        if _to_reverse(dict(zip(lines, others, strict=True)), allowed) is not None:
+            return "v0 and v1 are opposite sides, and so are u0 and u1: give them as Boundary(v0, v1, u0, u1)"
     return "make the polylines share their corner points"
+
+
+def _to_reverse(lines: dict[str, np.ndarray], allowed: float) -> list[str] | None:
+    """Which sides have to be reversed for the corners to meet, the fewest; None if that does not help."""
+    for flips in sorted(product((1, -1), repeat=4), reverse=True):
+        turned = {name: x[::flip] for (name, x), flip in zip(lines.items(), flips, strict=True)}
+        if max(_corner_gaps(turned)) <= allowed:
+            return [name for name, flip in zip(lines, flips, strict=True) if flip < 0]
+    return None

@@ -49,7 +49,8 @@ class Fit(eqx.Module):
         `folds` is their number, inside the loops where the surface is trimmed.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
-        foot was not found to the tolerance. Of an approximation also `method`, the name of its class. Of an
+        foot was not found to the tolerance. Of an approximation also `method`, the name of its class, and
+        `tol_average` and `tol_maximum`, infinite where none was given. Of an
         interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
         Methods add further entries, which their docstrings describe.

@@ -29,6 +29,7 @@ def facts(fit: Any) -> dict[str, str]:
     return {
         "net": "{} x {}".format(*fit.surface.shape),
         "order": "{} x {}".format(*fit.surface.order),
+        **_tolerance_facts(fit),
         "iterations": str(int(fit.stats["num_steps"])),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal{some}",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal{some}",
@@ -37,6 +38,15 @@ def facts(fit: Any) -> dict[str, str]:
         **_regularity_facts(fit),
         "stopped": fit.message,
     }
+
+
+def _tolerance_facts(fit: Any) -> dict[str, str]:
+    """What the fit of a cloud aimed at, in per cent: whoever passed per cent as a fraction sees it here."""
+    goals = [fit.stats.get(f"tol_{name}") for name in ("average", "maximum")]
+    if any(goal is None for goal in goals):
+        return {}
+    average, maximum = ("without limit" if np.isinf(x) else f"{100 * float(x):.4g} %" for x in goals)
+    return {"tolerances": f"average {average}, maximum {maximum}"}
 
 
 def _regularity_facts(fit: Any) -> dict[str, str]:
@@ -98,6 +108,8 @@ def _trim_facts(fit: Any) -> dict[str, str]:
     if trimmed is None or not _is_finite(fit):
         return {}
     holes = {0: "no hole", 1: "one hole"}.get(trimmed.holes, f"{trimmed.holes:,} holes")
+    if trimmed.holes and "hole_length" in fit.stats:
+        holes += f" (gaps wider than {float(fit.stats['hole_length']):.4g}, the hole length)"
     inside, errors = np.asarray(fit.inside), 100 * np.asarray(fit.errors, float)
     within = f"{int(inside.sum()):,} of {inside.size:,} points"
     if inside.any():

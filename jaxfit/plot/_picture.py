@@ -68,6 +68,8 @@ def surface_and_errors(
     ------
     ImportError
         If Matplotlib is not installed.
+    TypeError
+        If `points` is the name of a file.
     ValueError
         If `points` is a grid whose size is not the number of errors.
 
@@ -78,6 +80,8 @@ def surface_and_errors(
     >>> jf.plot.surface_and_errors(fit, title="a saddle").get_size_inches().tolist()
     [12.0, 5.2]
     """
+    if isinstance(points, (str, os.PathLike)):
+        raise TypeError(f"points must be an array, but is {points!r}; pass a file as path={str(points)!r}.")
     errors = _arrange(fit.errors, points)
     figure = blank_figure(12)
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
