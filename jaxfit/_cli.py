@@ -87,8 +87,9 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
         surface_and_errors(done.fit, points, path=picture, title=data.name)
     read_from = {"input": args.input, "points": _describe(data)}
     took = time.perf_counter() - started
+    method = done.fit.stats.get("method", done.method)
     outcome = {
-        "method": f"{done.method}, {'single' if args.float32 else 'double'} precision",
+        "method": f"{method}, {'single' if args.float32 else 'double'} precision",
         "time": f"fit {done.seconds:.2f} s, total {took:.2f} s",
         "written": ", ".join(str(path) for path in (args.output, picture, args.report) if path),
         **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),

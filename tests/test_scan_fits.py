@@ -108,6 +108,10 @@ def test_a_height_that_looks_like_no_data_among_others_is_data():
         assert not is_nodata(np.stack([x, y, heights], axis=1)).any()
 
 
+def test_a_printed_scan_names_the_tolerances_that_were_asked_for(fit):
+    assert "average 0.01 %, maximum without limit" in str(fit)
+
+
 @pytest.mark.slow
 def test_the_ends_of_a_scroll_are_fitted_as_well():
     angle, across = np.random.default_rng(0).uniform([[1.5 * np.pi], [0]], [[3 * np.pi], [10]], (2, 3000))

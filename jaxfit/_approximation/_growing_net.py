@@ -174,6 +174,7 @@ def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]
     if average is None or request["tol_maximum"] is not None:
         return fit(request)
     found = fit(request | {"tol_maximum": FAR * average, "throw": False})
+    found = dataclasses.replace(found, stats=found.stats | {"tol_maximum": np.inf})  # as it was asked for
     ended = found.result in (RESULTS.stalled, RESULTS.max_steps_reached)
     if ended and float(found.average_error) <= average:
         found = dataclasses.replace(found, result=RESULTS.converged)

@@ -119,7 +119,8 @@ def _pictures(fit: Any, points: Any) -> list[tuple[str, list[tuple[Any, str]]]]:
         where = "Feet of the points in the domain, and its knots"
         caption = f"{where}, with the outer loop (full) and holes (dashed)." if trimmed else f"{where}."
         pictures.append(("Loops" if trimmed else "Parameters", [(loops(fit), caption)]))
-    pictures.append(("History", [(history(fit), "Errors after every iteration.")]))
+    if int(fit.stats["num_steps"]):
+        pictures.append(("History", [(history(fit), "Errors after every iteration.")]))
     return pictures
 
 
