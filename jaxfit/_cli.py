@@ -97,8 +97,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        found = facts(done.fit) | {"tolerances": done.tolerances}
-        print_table({**read_from, "tolerances": "", **found, **outcome})
+        print_table({**read_from, **facts(done.fit), "tolerances": done.tolerances, **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 

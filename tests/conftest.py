@@ -76,7 +76,7 @@ def pytest_collection_modifyitems(config, items):
 
 # Linux gives a process 65,530 memory mappings, and every compiled kernel takes some: without this a worker
 # would be ended by the system somewhere in the second half of the session.
-MOST_MAPPINGS = 35_000
+MOST_MAPPINGS = 25_000
 
 
 @pytest.hookimpl(trylast=True)

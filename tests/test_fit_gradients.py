@@ -117,8 +117,8 @@ def test_the_derivative_is_that_of_the_polished_fit(name):
 
 
 BASE = base_of((6, 7), (4, 4))
-# Two of the cases, whose programs are there.
-REGULAR, PLATE = (CASES[name][0](CASES[name][1]) for name in ("default", "plate"))
+# Three of the cases, whose programs are there.
+REGULAR, PLATE, GROWING = (CASES[name][0](CASES[name][1]) for name in ("default", "plate", "new knots"))
 
 
 def height_of(points, weights, adjoint=None, max_steps=40, method=PLATE):
@@ -137,12 +137,13 @@ def test_gradients_run_in_jit_and_vmap():
         np.testing.assert_allclose(many[0], one, rtol=1e-6, atol=1e-9)
 
 
-def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right_derivative():
+@pytest.mark.parametrize("method", slow_except([PLATE, GROWING], PLATE), ids=["plate", "new knots"])
+def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right_derivative(method):
     special = np.asarray(BASE(jnp.array([0.0, 1.0, 0.0, 0.4]), jnp.array([0.3, 1.0, 0.0, 0.0])))
     outside = np.array([[-0.1, -0.1, 0.0], [0.5, -0.05, 0.02]])
     points = np.concatenate([POINTS[:192], special, outside, POINTS[:1], POINTS[:1]])
     weights = np.concatenate([WEIGHTS[:192], np.ones(7), [0.0]])
-    gradient = jax.grad(height_of, argnums=(0, 1))(points, weights)
+    gradient = jax.grad(partial(height_of, method=method), argnums=(0, 1))(points, weights)
     assert all(np.isfinite(x).all() for x in gradient)
     direction = np.zeros(points.shape)
     direction[192:] = np.random.default_rng(0).normal(size=(8, 3))
@@ -150,7 +151,7 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
     direction[192:196] = 0.0  # on the border, where the derivative is one-sided
 
     def polished(*x):
-        return height_of(*x, adjoint=AT_ROUNDING)
+        return height_of(*x, adjoint=AT_ROUNDING, method=method)
 
     difference = central_difference(polished, (points, weights), 0, direction, 1e-7)
     np.testing.assert_allclose(jnp.sum(gradient[0] * direction), difference, rtol=1e-6, atol=1e-7)
@@ -168,9 +169,11 @@ def test_a_surface_that_is_not_at_rest_says_so():
     assert "stationarity" not in jf.approximate(POINTS, BASE, **early).stats
 
 
-def test_a_derivative_far_from_rest_is_refused():
+@pytest.mark.parametrize("method", slow_except([PLATE, REGULAR], PLATE), ids=["plate", "default"])
+def test_a_derivative_far_from_rest_is_refused(method):
     def slope(adjoint):
-        return jax.grad(height_of, argnums=(0, 1))(POINTS, WEIGHTS, adjoint, max_steps=1)[0]
+        options = dict(max_steps=1, method=method)
+        return jax.grad(height_of, argnums=(0, 1))(POINTS, WEIGHTS, adjoint, **options)[0]
 
     with pytest.raises(ArithmeticError, match=r"not at rest .* pass a number as smoothing"):
         slope(jf.ImplicitAdjoint(polish_steps=0))

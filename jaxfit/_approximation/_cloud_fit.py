@@ -97,15 +97,7 @@ def fit_cloud(
         cloud, concrete = given[0], is_concrete(given)
         stats = stats | {"stationarity": share}
     parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete)
-    stats = {
-        "method": Name(type(method).__name__),
-        "num_steps": loop.current.step,
-        "tol_average": tolerances.average,
-        "tol_maximum": tolerances.maximum,
-        "diagonal": unit.diagonal,
-        "unconverged_feet": _sum(~parts[3]),
-        **stats,
-    }
+    stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
 
@@ -165,6 +157,20 @@ def tolerances_of(tol_average: Any, tol_maximum: Any, max_steps: int) -> Toleran
         xp: Any = np if is_concrete(x) else jnp
         parts.append(xp.asarray(np.inf if x is None else x, dtype))
     return Tolerances(parts[0], parts[1], np.asarray(max_steps, np.int32))
+
+
+def stats_of(
+    method: AbstractIterativeMethod, tolerances: Tolerances, steps: Any, unit: Unit, unconverged_feet: Any
+) -> dict[str, Any]:
+    """What the `stats` of every fit of a cloud hold."""
+    return {
+        "method": Name(type(method).__name__),
+        "num_steps": steps,
+        "tol_average": tolerances.average,
+        "tol_maximum": tolerances.maximum,
+        "diagonal": unit.diagonal,
+        "unconverged_feet": unconverged_feet,
+    }
 
 
 def working_surface(base: BSplineSurface, unit: Unit, concrete: bool) -> WorkingSurface:

@@ -20,6 +20,7 @@ from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
     fitted_surface,
     order_by_cell,
+    stats_of,
     tolerances_of,
     working_surface,
 )
@@ -34,7 +35,7 @@ from jaxfit._fit._loop import begin, iterate
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import MeshAxis, Tolerances, make_problem
 from jaxfit._fit._reasons import result_of
-from jaxfit._fit._result import Fit, Name, converged_or_raise
+from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._fit._scaling import Unit, unit_of
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import working_dtype
@@ -88,13 +89,7 @@ def fit_sharded_cloud(
         maximum_error=jax.device_put(maximum),
         history=public_history(end.history, end.step, getattr(method, "fairing", None)),
         result=result_of(end.code),
-        stats={
-            "method": Name(type(method).__name__),
-            "num_steps": end.step,
-            "diagonal": unit.diagonal,
-            "unconverged_feet": unconverged,
-            **end.stats,
-        },
+        stats=stats_of(method, tolerances, end.step, unit, unconverged) | end.stats,
     )
     return converged_or_raise(fit) if request["throw"] else fit
 

@@ -9,7 +9,13 @@ import jax
 import numpy as np
 
 from jaxfit._approximation._checked_arguments import check_options, checked_start, checked_weights
-from jaxfit._approximation._cloud_fit import LEAST_POINTS, fitted_surface, tolerances_of, working_surface
+from jaxfit._approximation._cloud_fit import (
+    LEAST_POINTS,
+    fitted_surface,
+    stats_of,
+    tolerances_of,
+    working_surface,
+)
 from jaxfit._approximation._errors import GlobalFeet
 from jaxfit._approximation._methods_by_sums import IN_BLOCKS, by_sums, static_and_numbers
 from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
@@ -19,7 +25,7 @@ from jaxfit._fit._loop import LoopState, begin, record_and_move
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem, make_problem, summary_of
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
-from jaxfit._fit._result import Fit, Name, converged_or_raise
+from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._fit._scaling import Unit, unit_of
 from jaxfit._precision import advise_x64, working_dtype
 from jaxfit._progress_line import doing
@@ -52,14 +58,8 @@ def fit_stream(
     lost = int(loop.code) == code_of(RESULTS.diverged)  # the stored feet are those of a surface given up
     errors = GlobalFeet() if request["errors"] is None else request["errors"]
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
-    stats = {
-        "method": Name(type(method).__name__),
-        "num_steps": loop.current.step,
-        "diagonal": unit.diagonal,
-        "unconverged_feet": unconverged,
-        "passes": passes.made + 1,  # with the first, which finds the unit
-        **stats,
-    }
+    known = stats_of(method, passes.tolerances, loop.current.step, unit, unconverged)
+    stats = known | {"passes": passes.made + 1} | stats  # with the first, which finds the unit
     fit = _fit(loop, passes.feet, surface, average, maximum, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
 
