@@ -1,7 +1,5 @@
 """jaxfit: point data into B-spline surfaces, differentiably."""
 
-__version__ = "0.1.0"
-
 from jaxfit import _interrupt as _interrupt  # first, for it acts on the other imports
 from jaxfit._approximation import AtParameters as AtParameters
 from jaxfit._approximation import ControlPointSums as ControlPointSums
@@ -95,6 +93,7 @@ from jaxfit._splines import insertion_matrix as insertion_matrix
 from jaxfit._splines import merge_knots as merge_knots
 from jaxfit._streams import approximate_stream as approximate_stream
 from jaxfit._trimmed import TrimmedSurface as TrimmedSurface
+from jaxfit._version import __version__ as __version__
 
 
 def __getattr__(name: str) -> object:

@@ -71,7 +71,8 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
         raise TypeError(f"{name} must hold real numbers, but has dtype {array.dtype}; convert it to floats.")
     if array.ndim != ndim:
         raise ValueError(
-            f"{name} must have {ndim} dimension{'s' * (ndim != 1)}, but has shape {array.shape}; reshape it."
+            f"{name} must have {ndim} dimension{'s' * (ndim != 1)}, but has shape {array.shape}; "
+            f"{_as_wanted(name, array.shape, ndim)}."
         )
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(np.float64 if isinstance(array, np.ndarray) else jnp.result_type(float))
@@ -80,6 +81,15 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     if is_concrete(array) and array.size:
         check_finite(name, array)
     return array
+
+
+def _as_wanted(name: str, shape: tuple[int, ...], ndim: int) -> str:
+    """What to do with an array whose number of dimensions is wrong: grids and clouds are often mixed up."""
+    if len(shape) == 3 and ndim == 2:
+        return f"pass {name}.reshape(-1, {shape[2]}), or interpolate it if it is a grid of data"
+    if len(shape) == 2 and ndim == 3 and name == "grid":
+        return "reshape it to (n, m, d) if its points stand row by row, or fit them by fit_points as a cloud"
+    return "reshape it"
 
 
 def unmasked(name: str, x: np.ma.MaskedArray) -> np.ndarray:
@@ -150,9 +160,9 @@ def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int 
     """`x` as a floating array (points, d) of at least `least` points."""
     array = as_floating(name, x, 2)
     if dimension is not None and array.shape[1] != dimension:
+        turned = f"pass {name}.T" if array.shape[0] == dimension else "give one row per point"
         raise ValueError(
-            f"{name} must have {dimension} coordinates a row, but has {array.shape[1]}; "
-            "give one row per point."
+            f"{name} must have {dimension} coordinates a row, but has {array.shape[1]}; {turned}."
         )
     if array.shape[1] < 1 or array.shape[0] < least:
         raise ValueError(

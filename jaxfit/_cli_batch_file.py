@@ -45,14 +45,19 @@ def job_of(args: argparse.Namespace, name: str) -> Job:
     given = {key: arguments[key] for key in _FIT_OPTIONS if arguments[key] not in (None, False)}
     for key in _FILES:
         if arguments[key] is not None:
-            given[key] += " " + version_of(arguments[key])
+            given[key] += " " + size_and_time_of(arguments[key])
     surface = f"{Path(path).stem}.npz"
     arguments |= {"input": path, "output": os.path.abspath(os.path.join(args.output, surface))}
-    row = {"input": path, "version": version_of(path), "options": json.dumps(given), "surface": surface}
+    row = {
+        "input": path,
+        "size_and_time": size_and_time_of(path),
+        "options": json.dumps(given),
+        "surface": surface,
+    }
     return Job(arguments, row)
 
 
-def version_of(path: str) -> str:
+def size_and_time_of(path: str) -> str:
     """Size and time of a file; empty where there is none."""
     try:
         status = os.stat(path)
@@ -92,7 +97,7 @@ def _fitted(args: argparse.Namespace) -> Row:
         "status": FITTED if done.reached else MISSED,
         "error": None,
         "points": len(data.cloud),
-        "method": done.method,
+        "method": str(fit.stats.get("method", done.method)),
         "net": "{}x{}".format(*fit.surface.shape),
         "order": "{}x{}".format(*fit.surface.order),
         "iterations": int(fit.stats["num_steps"]),

@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Mapping
 from typing import Any
 
-import jaxfit
 from jaxfit import io
 from jaxfit._cli_fit import FittedFile
 from jaxfit._cli_methods import OPTIONS
@@ -28,7 +27,6 @@ def write_page(
         points=data.cloud if data.grid is None else data.grid,
         title=data.name,
         tables={"Input": read, "Settings": _settings(args, done), "Output": written},
-        version=jaxfit.__version__,
     )
 
 

@@ -14,7 +14,7 @@ Row = dict[str, Any]
 
 COLUMNS = (
     "input status error points method net order iterations average_error_percent maximum_error_percent "
-    "folds message surface seconds version options"
+    "folds message surface seconds size_and_time options"
 ).split()
 FITTED, MISSED, FAILED = "fitted", "tolerance missed", "failed"
 _RESTS = 20  # times as long as the last writing took, before the table is written again
@@ -34,7 +34,7 @@ class Table:
     def is_done(self, wanted: Row, again: bool) -> bool:
         """Whether the row of this input stands, from the same file and with the same options."""
         row = self.rows.get(wanted["input"])
-        if row is None or any(row.get(key) != wanted[key] for key in ("version", "options")):
+        if row is None or any(row.get(key) != wanted[key] for key in ("size_and_time", "options")):
             return False
         if row["status"] == FAILED:
             return not again

@@ -47,6 +47,8 @@ def compile_quickly():
 
 
 def pytest_configure(config):
+    if config.getoption("--slow") and config.getoption("--float32"):
+        raise pytest.UsageError("--slow and --float32 are two passes: run one after the other")
     # The pass in single precision runs the code that users get.
     if not config.getoption("--float32") and not hasattr(config, "workerinput"):
         compile_quickly()

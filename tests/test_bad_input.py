@@ -221,7 +221,30 @@ def test_switches_arrays_and_text_are_no_numbers(value):
     with pytest.raises(TypeError, match="x must be a number, but is"):
         check_number("x", value, 0.0)
     with pytest.raises(ValueError, match="smoothing must be a finite number"):
-        check_smoothing(value)
+        check_smoothing(value, "a rule")
+
+
+@pytest.mark.parametrize(
+    ("call", "advice"),
+    [
+        (lambda: jf.fit_points(GRID, BOUNDARY), r"pass points.reshape\(-1, 3\), or interpolate it"),
+        (lambda: jf.fit_points(GRID), r"pass points.reshape\(-1, 3\), or interpolate it"),
+        (lambda: jf.fit_points(POINTS.T, BOUNDARY), "pass points.T"),
+        (lambda: jf.fit_points(POINTS.T), "pass points.T"),
+        (lambda: jf.fit_points(POINTS[:, :2], BOUNDARY), "give one row per point"),
+        (lambda: jf.interpolate(POINTS), "fit them by fit_points as a cloud"),
+        (lambda: jf.Boundary.from_grid(POINTS), "fit them by fit_points as a cloud"),
+        (lambda: jf.StandardApproximation(smoothing="gcv"), r"or GeneralizedCrossValidation\(\) or Disc"),
+        (lambda: jf.OrthogonalDistance(smoothing="auto"), r"or RegularSmoothing\(\)"),
+        (lambda: jf.fit_points(POINTS, BOUNDARY, net=(65, 64)), "at most 4,096 control points for 60 points"),
+        (lambda: jf.fit_points(POINTS, net=(65, 64)), "at most 4,096 control points for 60 points"),
+    ],
+)
+def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
+    monkeypatch.setattr(jax, "jit", None)
+    with pytest.raises(ValueError, match=advice) as error:
+        call()
+    sentence(error)
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,7 @@ def test_bad_files_are_reported_and_passed_over(folder, capsys):
     for name in GOOD:
         assert read_surface(f"out/{name}").shape == (6, 6)
         assert (table[name]["net"], table[name]["status"]) == ("6x6", "fitted")
+        assert table[name]["method"] == "OrthogonalDistance"
         assert 0 < table[name]["average_error_percent"] < 1
 
     before = state()  # a second run does nothing

@@ -31,6 +31,9 @@ def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
     assert float(grown.average_error) <= 1e-4
     assert grown.errors.shape == (COUNT,)
     assert (8, 8) < grown.surface.shape < (26, 26)
+    steps = int(grown.stats["num_steps"]), int(grown.stats["growth_steps"])
+    assert f"{steps[0]}, after {steps[1]} while the net grew\n" in str(grown)
+    assert steps[1] > 0
     coarse = jf.fit_points(CLEAN, BOUNDARY, tol_average=1e-2)
     assert coarse.converged
     assert coarse.surface.shape == (8, 8)

@@ -11,7 +11,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 
 # Lowest first; a room may import its own modules and those of the lines above it.
 ROOMS = [
-    ("_interrupt",),
+    ("_interrupt", "_version"),
     ("_checks",),
     ("_precision", "_progress_line"),
     ("_varying",),

@@ -62,6 +62,13 @@ def test_a_picture_is_saved_and_returned(tmp_path, suffix):
     assert any(text.startswith("average 0.0") and "maximum 0." in text for text in said)
 
 
+def test_a_picture_of_an_unknown_format_is_refused(tmp_path):
+    for picture, drawn in ((surface_and_errors, fake_fit((50,))), (zebra_stripes, wavy_surface())):
+        with pytest.raises(ValueError, match=r"p.foo has the suffix .foo, .* use one of .*\.pdf, .*\.png"):
+            picture(drawn, path=tmp_path / "p.foo")
+    assert not list(tmp_path.iterdir())
+
+
 def test_no_global_state_is_touched():
     surface_and_errors(fake_fit((50,)))
     assert "matplotlib.pyplot" not in sys.modules

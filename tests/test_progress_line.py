@@ -14,6 +14,7 @@ from helpers import wavy_cloud
 
 import jaxfit as jf
 from jaxfit import _progress_line
+from jaxfit._approximation import _cloud_fit
 from jaxfit._cli_report import progress_bar
 
 
@@ -64,6 +65,18 @@ def test_fits_say_what_they_do(shown):
     assert "jaxfit: making a base surface" in text
     assert "jaxfit: fitting 6 x 5 control points to 300 points" in text
     assert "jaxfit: interpolating a grid" in shown(jf.interpolate, GRID)
+
+
+def test_a_net_chosen_by_some_of_the_points_says_of_how_many(monkeypatch):
+    said = []
+    monkeypatch.setattr(_cloud_fit, "doing", said.append)
+    request = {"tol_average": 1e-3, "tol_maximum": None, "max_steps": 0, "weights": None, "start": None}
+    request |= {"progress": None, "throw": False, "errors": None, "adjoint": None}
+    base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 5))
+    for room in (None, _cloud_fit.Room((6, 5), 0, len(CLOUD)), _cloud_fit.Room((6, 5), 0, 400)):
+        _cloud_fit.fit_cloud(CLOUD, base, jf.OrthogonalDistance(), request, room)
+    counts = ["300", "300", "300 of 400"]
+    assert said == [f"fitting 6 x 5 control points to {count} points" for count in counts]
 
 
 def test_fits_side_by_side_share_one_line(shown):

@@ -64,7 +64,7 @@ def test_a_trimmed_fit_has_a_page_with_all_pictures(tmp_path):
     points, fit = fitted()
     fit = dataclasses.replace(fit, trimmed=jf.TrimmedSurface(fit.surface, LOOPS["an L with two holes"]))
     path = tmp_path / "r.html"
-    report(fit, path, points, title="a <b> & c", tables={"Input": {"file": "x<y"}}, version="1.2")
+    report(fit, path, points, title="a <b> & c", tables={"Input": {"file": "x<y"}})
     assert [item.name for item in tmp_path.iterdir()] == ["r.html"]
     text = path.read_text()
     page = Page(text)
@@ -74,7 +74,7 @@ def test_a_trimmed_fit_has_a_page_with_all_pictures(tmp_path):
         "x<y",
         "the outer one with 6 vertices, 2 holes",
         "OrthogonalDistance",
-        "1.2",
+        jf.__version__,
         np.__version__,
     ):
         assert said in page.cells

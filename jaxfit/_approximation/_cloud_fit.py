@@ -37,10 +37,12 @@ LEAST_POINTS = 4
 
 
 class Room(NamedTuple):
-    """What a fit has room for: fits with the same room are one program."""
+    """What a fit has room for: fits with the same room are one program. And the size of the whole cloud, of
+    which it may be given a part."""
 
     net: tuple[int, int]
     steps: int
+    points: int
 
 
 def fit_cloud(
@@ -77,7 +79,7 @@ def fit_cloud(
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
-    doing(f"fitting {base.shape[0]} x {base.shape[1]} control points to {cloud.shape[0]:,} points")
+    _announce(base.shape, cloud.shape[0], room)
     entries = max_steps if room is None else room.steps
     loop = begin(method, together, begun, u[order], v[order], entries)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
@@ -100,6 +102,11 @@ def fit_cloud(
     stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
+
+
+def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
+    points = f"{count:,}" if room is None or room.points == count else f"{count:,} of {room.points:,}"
+    doing(f"fitting {net[0]} x {net[1]} control points to {points} points")
 
 
 def _nearest(base: BSplineSurface, cloud: Any) -> tuple[Any, Any]:

@@ -19,6 +19,7 @@ from jaxfit._base import (
     Boundary,
     Coons,
     base_surface,
+    check_net_of_cloud,
     checked_net,
     default_base,
     default_net,
@@ -63,7 +64,8 @@ def fit_points(
     boundary : Boundary, optional
         The four sides of the patch.
     net : (nu, nv), optional
-        Control points along u and v, shared between the directions by the lengths of the sides if not given.
+        Control points along u and v, at most 16 for each point or 4,096 in all, if that is more. Shared
+        between the directions by the lengths of the sides if not given.
         Default: the net grows, see Notes. Where it cannot, for fewer than 500 points, a method with an
         `insertion` of its own, a `start` or no tolerance: about one control point for every eight points,
         at least twice the order and at most 64 each way.
@@ -87,21 +89,23 @@ def fit_points(
     Returns
     -------
     Fit
-        Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`, `nodata`,
-        `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in force,
-        `feet_on_border`: points on the sheet whose foot is on the border of the domain; and `sheet_area`,
-        that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their normals to the
-        mean with their neighbours first, for noise makes a mesh rough and its area too large. `counted` says
-        which points are on the sheet. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points
-        that were left out have errors as well, but do not count; where they are not finite u, v and errors
-        are NaN. A coordinate that stands for no data (nines such as -9999, the ends of 16 bits, beyond 1e20)
-        makes a point `nodata`, which counts as not finite, if it is far from all others.
+        Where the net has grown, `stats` also hold `growth_steps`: iterations with all nets before the last
+        fit. Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
+        `nodata`, `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in
+        force, `feet_on_border`: points on the sheet whose foot is on the border of the domain; and
+        `sheet_area`, that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their
+        normals to the mean with their neighbours first, for noise makes a mesh rough and its area too large.
+        `counted` says which points are on the sheet. `trimmed` is the surface cut to the sheet, a
+        `TrimmedSurface`. Points that were left out have errors as well, but do not count; where they are not
+        finite u, v and errors are NaN. A coordinate that stands for no data (nines such as -9999, the ends
+        of 16 bits, beyond 1e20) makes a point `nodata`, which counts as not finite, if it is far from all
+        others.
 
     Raises
     ------
     ValueError
-        As `base_surface` and `approximate` do. Without a boundary also if the points make no sheet: a disc,
-        with or without holes.
+        As `base_surface` and `approximate` do; for a net too large. Without a boundary also if the points
+        make no sheet: a disc, with or without holes.
     TypeError
         If there is no such option, points are traced by `jit` or `vmap`, or the boundary by these or `grad`;
         or if the fit is differentiated without a `net` or without a boundary.
@@ -175,7 +179,8 @@ def fit_points(
         request = _DEFAULTS | options
         growth = NetGrowth(np.asarray(cloud), BoundaryNets(boundary, order), default_method(method), request)
         return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
-    net = default_net(cloud.shape[0], boundary, order) if net is None else net
+    net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
+    check_net_of_cloud(net, cloud.shape[0])
     return approximate(cloud, _base(boundary, fixed, net, order, base), method, **options)
 
 
@@ -220,7 +225,9 @@ def _without_boundary(
     if finite.any():  # or else `fit_scan` says what is wrong
         whole = np.where(finite[:, None], scan.points, scan.points[np.argmax(finite)])
         checked_request(whole, method=method, **options)
-    net = None if net is None else checked_net(net, order)
+    if net is not None:
+        net = checked_net(net, order)
+        check_net_of_cloud(net, int(finite.sum()))
     grows = net is None and _may_grow(scan.points[finite], method, options)
     return fit_scan(scan, net, order, method, _DEFAULTS | options, grows)
 

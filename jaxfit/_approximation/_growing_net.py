@@ -70,6 +70,7 @@ class NetGrowth:
         average, maximum = request["tol_average"], request["tol_maximum"]
         self.far = np.inf if average is None or maximum is not None else FAR * float(average)
         self.most = float(np.sqrt(len(counted) / nets.points_a_control_point))
+        self.steps = 0  # iterations so far, of all nets
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
@@ -78,9 +79,10 @@ class NetGrowth:
     def fit(self, points: Any, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of `points`, in a program for nets of similar size and for any number of iterations."""
         net = [next((room for room in ROOMS if room >= n), n) for n in base.shape]
-        return fit_cloud(
-            points, base, self.method, request, Room((net[0], net[1]), self.request["max_steps"])
-        )
+        room = Room((net[0], net[1]), self.request["max_steps"], len(self.points))
+        fit = fit_cloud(points, base, self.method, request, room)
+        self.steps += int(fit.stats["num_steps"])
+        return fit
 
     def whole(self, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of all points."""
@@ -198,4 +200,6 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
         fit = growth.whole(growth.nets.carried(fit.surface, net), request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
+    before = growth.steps - int(fit.stats["num_steps"])
+    fit = dataclasses.replace(fit, stats=fit.stats | {"growth_steps": before})
     return converged_or_raise(fit) if growth.request["throw"] else fit

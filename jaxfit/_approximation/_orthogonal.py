@@ -177,7 +177,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     def __check_init__(self) -> None:
         if not isinstance(self.smoothing, RegularSmoothing):
-            check_smoothing(self.smoothing)
+            check_smoothing(self.smoothing, "RegularSmoothing()")
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")

@@ -10,8 +10,8 @@ from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import ThinPlate, thin_plate
 
 
-def check_smoothing(smoothing: Any) -> None:
-    """Raise unless lambda is a finite number of at least 0, or traced."""
+def check_smoothing(smoothing: Any, rules: str) -> None:
+    """Raise unless lambda is a finite number of at least 0, or traced; `rules` are what may stand for it."""
     if not is_concrete(smoothing):
         return
     try:
@@ -23,7 +23,7 @@ def check_smoothing(smoothing: Any) -> None:
     if value.ndim or not 0 <= value < np.inf:
         raise ValueError(
             f"smoothing must be a finite number of at least 0, but is {smoothing!r}; pass "
-            "lambda, for instance 2e-5."
+            f"lambda, for instance 2e-5, or {rules}."
         )
 
 

@@ -111,7 +111,7 @@ class StandardApproximation(AbstractIterativeMethod):
     def __check_init__(self) -> None:
         check_kind("solver", self.solver, AbstractLeastSquares, "GaussNewton()")
         if not isinstance(self.smoothing, AbstractSmoothing):
-            check_smoothing(self.smoothing)
+            check_smoothing(self.smoothing, "GeneralizedCrossValidation() or Discrepancy(noise)")
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_kind("border", self.border, AbstractBorder, "FixedBorder()")

@@ -11,6 +11,7 @@ from jaxfit._base._coons import Uniform as Uniform
 from jaxfit._base._coons import coons_surface as coons_surface
 from jaxfit._base._default_base import default_base as default_base
 from jaxfit._base._default_net import MOST_CONTROL_POINTS as MOST_CONTROL_POINTS
+from jaxfit._base._default_net import check_net_of_cloud as check_net_of_cloud
 from jaxfit._base._default_net import checked_net as checked_net
 from jaxfit._base._default_net import default_net as default_net
 from jaxfit._base._default_net import default_size as default_size

@@ -10,6 +10,7 @@ from jaxfit._base._douglas_peucker import chord_lengths
 
 POINTS_PER_CONTROL_POINT = 8
 MOST_CONTROL_POINTS = 64  # per direction
+MOST_A_POINT = 16  # control points for each point of a cloud, of nets larger than the largest default one
 LARGEST_NET = 10_000_000  # control points in all: a fit of more would not fit in memory
 
 
@@ -60,3 +61,14 @@ def checked_net(net: Any, order: tuple[int, int]) -> tuple[int, int]:
             f"net must have at most {LARGEST_NET} control points, but {nu} x {nv} are asked for; lower it."
         )
     return nu, nv
+
+
+def check_net_of_cloud(net: tuple[int, int], count: int) -> None:
+    """Raise if a net is so much larger than a cloud of `count` points that these say nothing about most of
+    it."""
+    most = max(MOST_CONTROL_POINTS**2, MOST_A_POINT * count)
+    if net[0] * net[1] > most:
+        raise ValueError(
+            f"net must have at most {most:,} control points for {count:,} points, but {net[0]} x {net[1]} "
+            "are asked for; lower it."
+        )

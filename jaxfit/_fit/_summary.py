@@ -27,10 +27,10 @@ def facts(fit: Any) -> dict[str, str]:
     """
     some = ", without points left out" if _left_out(fit) else ""
     return {
-        "net": "{} x {}".format(*fit.surface.shape),
+        "net": _said_net(fit),
         "order": "{} x {}".format(*fit.surface.order),
         **_tolerance_facts(fit),
-        "iterations": str(int(fit.stats["num_steps"])),
+        "iterations": _said_iterations(fit),
         "average error": f"{100 * float(fit.average_error):.4g} % of the diagonal{some}",
         "maximum error": f"{100 * float(fit.maximum_error):.4g} % of the diagonal{some}",
         **_cleaning_facts(fit),
@@ -38,6 +38,17 @@ def facts(fit: Any) -> dict[str, str]:
         **_regularity_facts(fit),
         "stopped": fit.message,
     }
+
+
+def _said_net(fit: Any) -> str:
+    nu, nv = fit.surface.shape
+    surplus = "method" in fit.stats and nu * nv > np.size(fit.errors)
+    return f"{nu} x {nv}{', more control points than points' if surplus else ''}"
+
+
+def _said_iterations(fit: Any) -> str:
+    before = fit.stats.get("growth_steps", 0)
+    return f"{int(fit.stats['num_steps'])}{f', after {int(before)} while the net grew' if before else ''}"
 
 
 def _tolerance_facts(fit: Any) -> dict[str, str]:
@@ -198,7 +209,8 @@ def describe_briefly(fit: "Fit") -> str:
         return eqx.tree_pformat(fit)
     said = facts(fit)
     errors = ", ".join(f"{which} error {said[f'{which} error']}" for which in ("average", "maximum"))
-    return f"<Fit: {said['net']} control points, {errors.replace(' of the diagonal,', ',')}; {fit.message}>"
+    net = "{} x {}".format(*fit.surface.shape)
+    return f"<Fit: {net} control points, {errors.replace(' of the diagonal,', ',')}; {fit.message}>"
 
 
 def is_single(fit: "Fit") -> bool:

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxfit._fit._summary import errors_of_all
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit._trimmed._trimmed_surface import host_loops
-from jaxfit.io._output import write_atomically
+from jaxfit.io._output import check_output, write_atomically
 from jaxfit.plot._part import folds_in, of_fit
 from jaxfit.plot._render import render
 from jaxfit.plot._view import View
@@ -247,6 +247,9 @@ def blank_figure(width: int, rows: int = 1) -> "Figure":
 
 
 def save(figure: "Figure", path: Path, dpi: int) -> None:
+    """Write a picture, whole or not at all; a name without a suffix gets a PNG."""
+    if path.suffix:
+        check_output(path, tuple(f".{name}" for name in sorted(figure.canvas.get_supported_filetypes())))
     buffer = io.BytesIO()
     figure.savefig(buffer, format=path.suffix.lstrip(".").lower() or "png", dpi=dpi)
     write_atomically(path, buffer.getvalue())

@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 
 from jaxfit._fit._summary import facts
+from jaxfit._version import __version__
 from jaxfit.io._output import write_atomically
 from jaxfit.plot._history import history
 from jaxfit.plot._loops import loops
@@ -55,7 +56,6 @@ def report(
     points: Any = None,
     title: str = "B-spline surface",
     tables: Mapping[str, Mapping[str, str]] | None = None,
-    version: str = "",
 ) -> None:
     """Write one page of HTML about a fit: result, pictures and versions, without requests to anywhere.
 
@@ -75,8 +75,6 @@ def report(
         Heading, for instance the name of the data.
     tables
         More tables, by their headings; they come first.
-    version
-        That of the program that asks, for the table of versions.
 
     Raises
     ------
@@ -101,7 +99,7 @@ def report(
     }
     parts = [_table(heading, values) for heading, values in rows.items()]
     parts += [_figures(*pictures) for pictures in _pictures(fit, points)]
-    parts.append(_table("Versions", _versions(version)))
+    parts.append(_table("Versions", _versions()))
     page = _PAGE.format(title=html.escape(title), body="\n".join(parts))
     write_atomically(path, page.encode())
 
@@ -149,10 +147,10 @@ def _figure(name: str, figure: Any, caption: str) -> str:
     )
 
 
-def _versions(version: str) -> dict[str, str]:
+def _versions() -> dict[str, str]:
     device = jax.devices()[0]
     return {
-        **({"jaxfit": version} if version else {}),
+        "jaxfit": __version__,
         "Python": platform.python_version(),
         "JAX": f"{jax.__version__} on {device.platform} ({device.device_kind})",
         "NumPy": np.__version__,
