@@ -6,7 +6,7 @@
 
 Times are medians after a first call, which compiles, with the lowest and the highest. Every timed fit is
 judged by true closest points and folds, by SciPy alone. A study takes its own options, see
-`python -m benchmarks local --help`.
+`python -m benchmarks streams --help`.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 
 SUITES = {
-    "paper": "Tables 1 to 5 and Figures 1, 2, 4b, 7, 8 and 10 of the paper",
+    "paper": "Tables 1 to 5, Figures 1, 2, 4b, 7, 8 and 10 and the local mode of the paper",
     "peers": "beside SciPy, CHOLMOD, geomdl, splinepy, splipy, G+Smo and Open CASCADE, on the same arrays",
     "scaling": "time of a pass and error by the number of points and of control points",
     "compile": "first and later calls, each in a process of its own",
@@ -31,7 +31,6 @@ STUDIES = {
     "devices": "a cloud divided among devices, and among processes",
     "closest_point": "closest points: time a point, and how many are wrong",
     "growing_net": "the net chosen for a tolerance, and noise",
-    "local": "local mode",
     "streams": "clouds in files, larger than memory",
     "orthogonal": "orthogonal distance: passes, errors, outliers",
     "pictures": "base, default and paper side by side",

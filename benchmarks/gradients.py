@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxfit as jf
+from benchmarks import _inputs
 from benchmarks._referee import judged_surface
 from benchmarks._timing import in_turns
 from benchmarks.scaling import cloud
@@ -30,12 +31,17 @@ def fits(report, options):
         base = jf.base_surface(boundary, net=(net, net))
         for name, method in METHODS.items():
             try:
-                _row(report, points, base, name, method, options.runs)
+                _row(report, "made, noisy", points, base, name, method, options.runs)
             except ArithmeticError as refusal:
                 report.remark(f"{name}, {count} points, {net}x{net}: {refusal}")
+    if not options.quick:
+        head = list(_inputs.clouds(options.stand_ins))[1]
+        base = jf.base_surface(head.boundary, head.points, net=head.net, method=jf.Meshless())
+        name = "orthogonal distance"
+        _row(report, f"head ({head.source})", head.points, base, name, METHODS[name], options.runs)
 
 
-def _row(report, points, base, name, method, runs):
+def _row(report, model, points, base, name, method, runs):
     def fitted(points, adjoint=None):
         return jf.approximate(points, base, method, tol_average=1e-12, max_steps=40, adjoint=adjoint)
 
@@ -50,9 +56,12 @@ def _row(report, points, base, name, method, runs):
     slope, difference = float(jnp.sum(done["gradient"].result * direction)), (ends[0] - ends[1]) / 2e-6
     report.row(
         method=name,
+        model=model,
         points=len(points),
         net="{}x{}".format(*base.shape),
         **judged_surface(done["fit"].result.surface, points),
+        fit_first_s=done["fit"].first,
+        gradient_first_s=done["gradient"].first,
         fit_s=done["fit"].median,
         gradient_s=done["gradient"].median,
         lowest_s=min(done["gradient"].later),
