@@ -25,7 +25,7 @@ from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
-from jaxfit._fit._reasons import result_of
+from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, Name, converged_or_raise
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface
@@ -271,11 +271,13 @@ def _fit(
     stats: dict[str, Any],
     fairing: Any,
 ) -> Fit:
-    """The result. Averages and maxima are over the points of positive weight."""
+    """The result. Averages and maxima are over the points of positive weight. Errors include a bound on the
+    rounding of the control points."""
     concrete = is_concrete(loop, parts, unit)
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)
-    relative = distance / unit.diagonal
+    rounding = without_derivatives(unit.loss(xp.asarray(surface.control_points)))
+    relative = distance / unit.diagonal + rounding
     counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
     average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
     maximum = xp.max(xp.where(counted, relative, 0.0))
@@ -290,9 +292,17 @@ def _fit(
         average_error=arrays[3],
         maximum_error=arrays[4],
         history=public_history(loop.history, loop.current.step, fairing),
-        result=result_of(loop.code),
+        result=result_of(code_with_rounding(loop.code, average, maximum, problem.tolerances)),
         stats=stats,
     )
+
+
+def code_with_rounding(code: Any, average: Any, maximum: Any, goal: Tolerances) -> Any:
+    """`code`, or that of a fit whose tolerances the rounding of its control points has cost."""
+    met = (average <= goal.average) & (maximum <= goal.maximum)
+    lost = (code == code_of(RESULTS.converged)) & ~met
+    xp: Any = np if is_concrete(code, lost) else jnp
+    return xp.where(lost, np.int32(code_of(RESULTS.rounded)), code)
 
 
 def _sum(x: Any) -> Any:

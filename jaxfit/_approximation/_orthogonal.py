@@ -25,7 +25,7 @@ from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
-from jaxfit._approximation._regular_smoothing import FoldGuard, RegularSmoothing
+from jaxfit._approximation._regular_smoothing import SETTLED_AT, FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
     as_smoothing,
@@ -193,8 +193,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     @property
     def stall_since(self) -> int:
-        """The first iteration."""
-        return 0
+        """The first iteration, or the one from which on `RegularSmoothing` smooths no more."""
+        return SETTLED_AT if isinstance(self.smoothing, RegularSmoothing) else 0
 
     @property
     def finds_feet(self) -> bool:
@@ -243,7 +243,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         guard = state.guard
         if guard is not None:
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
-            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order)
+            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, new.step)
         # A step that folds is taken again with more smoothing there, not with more damping everywhere.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))

@@ -18,6 +18,7 @@ from jax.sharding import PartitionSpec as P
 from jaxfit._approximation._checked_arguments import check_options, checked_start
 from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
+    code_with_rounding,
     fitted_surface,
     order_by_cell,
     stats_of,
@@ -75,7 +76,8 @@ def fit_sharded_cloud(
     known = local_rows(u), local_rows(v), local_rows(error) * unit.scale, local_rows(converged)
     errors = GlobalFeet() if request["errors"] is None else request["errors"]
     u, v, distance, converged = errors.feet(surface, local_rows(points), known, summed.finds_feet)
-    parts = (u, v, np.asarray(distance) / unit.diagonal, np.asarray(converged))
+    rounding = unit.loss(np.asarray(surface.control_points))
+    parts = (u, v, np.asarray(distance) / unit.diagonal + rounding, np.asarray(converged))
     u, v, relative, converged = (with_local_rows(np.asarray(x), points) for x in parts)
     average, maximum, unconverged = jax.tree.map(
         np.asarray, _averages(mesh, axis, relative, weights, converged)
@@ -88,7 +90,7 @@ def fit_sharded_cloud(
         average_error=jax.device_put(average),
         maximum_error=jax.device_put(maximum),
         history=public_history(end.history, end.step, getattr(method, "fairing", None)),
-        result=result_of(end.code),
+        result=result_of(code_with_rounding(end.code, average, maximum, tolerances)),
         stats=stats_of(method, tolerances, end.step, unit, unconverged) | end.stats,
     )
     return converged_or_raise(fit) if request["throw"] else fit

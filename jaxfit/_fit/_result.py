@@ -34,9 +34,9 @@ class Fit(eqx.Module):
         Parameters of the foot point of every data point. With `errors` in single precision from
         `approximate_stream`, which gives NumPy arrays.
     errors : array (points,), or (n, m) for a grid
-        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. Errors of an
-        interpolation include a bound on the rounding of the control points. They do not include the rounding
-        of evaluating the surface, which is about as large far from the origin.
+        |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. They include a
+        bound on the rounding of the control points. They do not include the rounding of evaluating the
+        surface, which is about as large far from the origin.
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
