@@ -1,5 +1,6 @@
 """Checks of what users hand in: one sentence each, before anything is compiled."""
 
+import os
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any
@@ -57,6 +58,10 @@ def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
     array: Any = x
+    if isinstance(x, str | os.PathLike):
+        raise TypeError(
+            f"{name} must be an array, but is {os.fspath(x)!r}; read a file by jaxfit.io.read_points."
+        )
     if isinstance(array, np.ma.MaskedArray):
         array = unmasked(name, array)
     if not isinstance(array, (np.ndarray, jax.Array)):

@@ -71,7 +71,8 @@ def _report(row: Row, count: str, quiet: bool) -> None:
         print(f"jaxfit: error: {_with_name(row)}", file=sys.stderr, flush=True)
     elif not quiet:
         errors = (f"{which} {row[f'{which}_error_percent']:.4g} %" for which in ("average", "maximum"))
-        print(f"{count}  {row['input']}  {', '.join(errors)}", flush=True)
+        missed = f"  ({MISSED})" if row["status"] == MISSED else ""
+        print(f"{count}  {row['input']}  {', '.join(errors)}{missed}", flush=True)
 
 
 def _with_name(row: Row) -> str:

@@ -18,6 +18,7 @@ from jaxfit._cli_methods import OPTIONS as METHOD_OPTIONS
 from jaxfit._cli_report import as_sentence
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row
+from jaxfit._fit._summary import left_out
 from jaxfit._precision import bucket
 
 _FIT_OPTIONS = (
@@ -98,6 +99,7 @@ def _fitted(args: argparse.Namespace) -> Row:
         "error": None,
         "points": len(data.cloud),
         "method": str(fit.stats.get("method", done.method)),
+        "left_out": sum(left_out(fit).values()),
         "net": "{}x{}".format(*fit.surface.shape),
         "order": "{}x{}".format(*fit.surface.order),
         "iterations": int(fit.stats["num_steps"]),

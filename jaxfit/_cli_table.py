@@ -13,8 +13,8 @@ from jaxfit.io._output import write_atomically
 Row = dict[str, Any]
 
 COLUMNS = (
-    "input status error points method net order iterations average_error_percent maximum_error_percent "
-    "folds message surface seconds size_and_time options"
+    "input status error points left_out method net order iterations average_error_percent "
+    "maximum_error_percent folds message surface seconds size_and_time options"
 ).split()
 FITTED, MISSED, FAILED = "fitted", "tolerance missed", "failed"
 _RESTS = 20  # times as long as the last writing took, before the table is written again

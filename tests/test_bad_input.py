@@ -1,5 +1,6 @@
 """What would mislead a fit is refused in a sentence, before anything is computed or allocated."""
 
+import inspect
 import io
 import os
 import re
@@ -18,7 +19,7 @@ from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 import jaxfit as jf
 from jaxfit import _cli
 from jaxfit._approximation._smoothing_term import check_smoothing
-from jaxfit._checks import check_number
+from jaxfit._checks import as_floating, check_number
 from jaxfit.io import InputError, read_points, read_surface, write_surface
 
 GRID = wavy_grid(8, 7)
@@ -69,12 +70,29 @@ def test_named_columns_of_whole_numbers_are_no_decimal_commas(tmp_path):
 def test_a_column_that_counts_the_points_is_refused(tmp_path, first, name):
     delimiter = "," if name == "a.csv" else " "
     numbered = np.column_stack([np.arange(first, first + 60), POINTS])
-    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="n,x,y,z", comments="")
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="n,a,b,c", comments="")
     with pytest.raises(InputError, match=f"{name}: the first column only counts the points") as error:
         read_points(tmp_path / name)
     assert "remove it" in sentence(error)
     np.savetxt(tmp_path / name, numbered[:, [1, 2, 3, 0]], delimiter=delimiter)
     np.testing.assert_array_equal(read_points(tmp_path / name).points, POINTS)
+
+
+@pytest.mark.parametrize(("name", "delimiter"), [("a.csv", ","), ("a.xyz", " ")])
+@pytest.mark.parametrize("names", ["n x y z", "z y x w", 'w "Z" "X" "Y"'])
+def test_columns_are_found_by_their_names(tmp_path, name, delimiter, names):
+    where = [names.replace('"', "").lower().split().index(axis) for axis in "xyz"]
+    table = np.full((60, 4), 7.5)
+    table[:, where] = POINTS
+    header = delimiter.join(names.split())
+    np.savetxt(tmp_path / name, table, delimiter=delimiter, header=header, comments="")
+    np.testing.assert_allclose(read_points(tmp_path / name).points, POINTS)
+
+
+def test_a_short_line_of_whole_numbers_is_named(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6\n1,2\n7,8,9\n")
+    with pytest.raises(InputError, match="line 4 has 2 columns, but a point has three"):
+        read_points(tmp_path / "a.csv")
 
 
 # -------------------------------------------------------------------- archives
@@ -238,11 +256,43 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         (lambda: jf.OrthogonalDistance(smoothing="auto"), r"or RegularSmoothing\(\)"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, net=(65, 64)), "at most 4,096 control points for 60 points"),
         (lambda: jf.fit_points(POINTS, net=(65, 64)), "at most 4,096 control points for 60 points"),
+        (lambda: jf.fit_points(POINTS, BOUNDARY, tol_average=6), "must be at most 1, .* 6e-4 for 0.06 %"),
+        (lambda: jf.approximate(POINTS, wavy_surface(), tol_maximum=1.5), "such as 6e-4 for 0.06 %"),
     ],
 )
 def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
     monkeypatch.setattr(jax, "jit", None)
     with pytest.raises(ValueError, match=advice) as error:
+        call()
+    sentence(error)
+
+
+@pytest.mark.parametrize(
+    ("call", "advice"),
+    [
+        (
+            lambda: inspect.unwrap(as_floating)("points", "a.csv", 2),
+            "points must be an array, but is 'a.csv'",
+        ),
+        (lambda: inspect.unwrap(as_floating)("grid", CHECKOUT, 3), "read a file by jaxfit.io.read_points"),
+        (
+            lambda: inspect.unwrap(jf.fit_points)(POINTS, BOUNDARY, base="meshless"),
+            "base must be an object such as Coons",
+        ),
+        (lambda: jf.fit_points(POINTS, BOUNDARY, degree=3), "degree is not an option .* pass order"),
+        (lambda: jf.fit_points(POINTS, BOUNDARY, nett=3), "pass any of boundary, net, order, method, base"),
+        (
+            lambda: jf.approximate(POINTS, wavy_surface(), jf.GeometricInterpolation()),
+            r"GeometricInterpolation\(\) is one for grids; call interpolate",
+        ),
+        (
+            lambda: jax.eval_shape(lambda x: jf.fit_points(x, BOUNDARY, net=(6, 5)), POINTS),
+            "points must be concrete, but are traced; call fit_points outside jit and vmap",
+        ),
+    ],
+)
+def test_what_is_of_the_wrong_kind_gets_the_advice_that_helps(call, advice):
+    with pytest.raises(TypeError, match=advice) as error:
         call()
     sentence(error)
 
@@ -302,7 +352,7 @@ def test_a_printed_fit_tells_its_errors(fit):
     for said in (
         "8 x 7",
         "4 x 4",
-        "interpolation",
+        "GeometricInterpolation",
         " % of the diagonal",
         "all tolerances are met",
         "iterations",

@@ -79,3 +79,19 @@ def test_a_traced_smoothing_that_is_none_is_told(method):
         assert found.result == jf.RESULTS.diverged
         np.testing.assert_array_equal(found.surface.control_points, base.control_points)
         assert np.isfinite(found.average_error)
+
+
+def test_control_points_that_rounding_takes_off_the_points_are_told():
+    near, base = cloud(300), flat_base(8)
+    fit = jf.approximate(near, base, tol_average=1e-2)
+    assert fit.converged
+    far = near + 1e6
+    net = np.asarray(base.control_points, np.float32) + np.float32(1e6)
+    rounded = jf.approximate(far, jf.BSplineSurface(net, base.knots_u, base.knots_v), tol_average=1e-2)
+    assert rounded.result == jf.RESULTS.rounded
+    assert not rounded.converged
+    assert "until the control points were rounded" in rounded.message
+    # Units in the last place of 1e6 are 1/16, so a control point is off by up to 1/32 in each coordinate.
+    assert rounded.average_error > np.sqrt(3) / 32 / float(rounded.stats["diagonal"])
+    exact = jf.BSplineSurface(net.astype(float), base.knots_u, base.knots_v)
+    assert jf.approximate(far, exact, tol_average=1e-2).converged

@@ -54,6 +54,12 @@ def check_options(
 ) -> None:
     """Raise unless the options of a fit are valid that say nothing about single points."""
     check_switch("throw", throw)
+    if hasattr(method, "check_normals"):  # which only methods for grids have
+        name = type(method).__name__
+        raise TypeError(
+            f"method must be one for clouds such as OrthogonalDistance(), but {name}() is one for grids; "
+            "call interpolate."
+        )
     if method is not None:
         check_kind("method", method, AbstractIterativeMethod, "OrthogonalDistance()")
     if errors is not None:
@@ -64,6 +70,11 @@ def check_options(
     for name, tolerance in (("tol_average", tol_average), ("tol_maximum", tol_maximum)):
         if tolerance is not None and is_concrete(tolerance):
             check_number(name, tolerance, 0.0)
+            if float(tolerance) > 1:
+                raise ValueError(
+                    f"{name} must be at most 1, but is {tolerance!r}; give a fraction of the diagonal, such "
+                    "as 6e-4 for 0.06 %."
+                )
     if progress is not None and not callable(progress):
         raise TypeError(
             f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "

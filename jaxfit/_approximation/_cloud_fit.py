@@ -271,13 +271,14 @@ def _fit(
     stats: dict[str, Any],
     fairing: Any,
 ) -> Fit:
-    """The result. Averages and maxima are over the points of positive weight. Errors include a bound on the
-    rounding of the control points."""
+    """The result. Averages and maxima are over the points of positive weight. Outside transformations errors
+    include a bound on the rounding of the control points."""
     concrete = is_concrete(loop, parts, unit)
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)
-    rounding = without_derivatives(unit.loss(xp.asarray(surface.control_points)))
-    relative = distance / unit.diagonal + rounding
+    relative = distance / unit.diagonal
+    if concrete:
+        relative = relative + unit.loss(np.asarray(surface.control_points))
     counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
     average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
     maximum = xp.max(xp.where(counted, relative, 0.0))
@@ -292,17 +293,18 @@ def _fit(
         average_error=arrays[3],
         maximum_error=arrays[4],
         history=public_history(loop.history, loop.current.step, fairing),
-        result=result_of(code_with_rounding(loop.code, average, maximum, problem.tolerances)),
+        result=result_of(
+            code_with_rounding(loop.code, average, maximum, problem.tolerances) if concrete else loop.code
+        ),
         stats=stats,
     )
 
 
 def code_with_rounding(code: Any, average: Any, maximum: Any, goal: Tolerances) -> Any:
     """`code`, or that of a fit whose tolerances the rounding of its control points has cost."""
-    met = (average <= goal.average) & (maximum <= goal.maximum)
-    lost = (code == code_of(RESULTS.converged)) & ~met
-    xp: Any = np if is_concrete(code, lost) else jnp
-    return xp.where(lost, np.int32(code_of(RESULTS.rounded)), code)
+    met = np.asarray(average) <= goal.average and np.asarray(maximum) <= goal.maximum
+    lost = int(code) == code_of(RESULTS.converged) and not met
+    return np.int32(code_of(RESULTS.rounded)) if lost else code
 
 
 def _sum(x: Any) -> Any:

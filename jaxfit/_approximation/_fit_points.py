@@ -165,6 +165,7 @@ def fit_points(
     if boundary is None:
         return _without_boundary(points, faces, hole_length, net, order, method, base, options)
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
+    check_kind("base", base, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     for name, value in (("faces", faces), ("hole_length", hole_length)):
         if value is not None:
             raise ValueError(
@@ -173,6 +174,11 @@ def fit_points(
             )
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
     fixed, known = without_derivatives((cloud, options))
+    if not is_concrete(fixed):
+        raise TypeError(
+            "points must be concrete, but are traced; call fit_points outside jit and vmap, or make the base "
+            "surface outside and call approximate inside."
+        )
     checked_request(fixed, method=without_derivatives(method), **known)
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
@@ -255,7 +261,13 @@ _DEFAULTS = {
 }
 
 
+_OWN = "boundary net order method base faces hole_length".split()
+
+
 def _check_names(options: dict[str, Any]) -> None:
     for name in options:
+        if name in ("degree", "degrees"):
+            raise TypeError(f"{name} is not an option of fit_points; pass order, degree + 1 along u and v.")
         if name not in _DEFAULTS:
-            raise TypeError(f"{name} is not an option of fit_points; pass any of {', '.join(_DEFAULTS)}.")
+            names = ", ".join([*_OWN, *_DEFAULTS])
+            raise TypeError(f"{name} is not an option of fit_points; pass any of {names}.")

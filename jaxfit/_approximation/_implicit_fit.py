@@ -119,8 +119,9 @@ def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
     if not found <= max(TRUSTED, goal):
         raise ArithmeticError(
             f"the fit has no derivative here: after up to {adjoint.polish_steps} Newton steps its surface is "
-            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, goal):.0e}); pass a number as "
-            "smoothing, fewer control points, or ImplicitAdjoint(polish_steps=...) with more steps."
+            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, goal):.0e}); fit by "
+            "OrthogonalDistance with a number as smoothing, take fewer control points, or pass "
+            "ImplicitAdjoint(polish_steps=...) with more steps or UnrolledAdjoint()."
         )
 
 

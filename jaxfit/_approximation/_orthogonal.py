@@ -157,7 +157,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     --------
     >>> method = jf.OrthogonalDistance(loss=jf.Huber(), border=jf.FixedCorners())
     >>> method.smoothing.least, method.damping, method.reach
-    (5.0, 0.01, 0.6)
+    (3.0, 0.01, 0.6)
     >>> jf.OrthogonalDistance(damping=2.0)
     Traceback (most recent call last):
     ...

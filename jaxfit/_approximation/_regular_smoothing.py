@@ -84,7 +84,7 @@ class RegularSmoothing(eqx.Module):
     plate of weight 5e-6 against the sum over the points, and there are no folds. Where a surface is far
     smoother than its net, a coarser net or a greater `least` is better. `first` matters: the large shape has
     to settle before detail is followed. Smoothing once more took average errors of six fits of a head (nets
-    of 30 x 30 to 50 x 50, some points left out) to 0.67 times what they were.
+    of 30 x 30 to 50 x 50, some points left out) to 0.67 times what they are without.
 
     Source: this library's own. The thin plate that it departs from is equation (10) of Kineri, Wang, Lin and
     Maekawa (2012).

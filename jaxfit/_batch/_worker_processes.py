@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from pathlib import Path
 
 import jax
@@ -41,6 +41,8 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
         For fewer than one.
     TypeError
         If `workers` is no whole number.
+    RuntimeError
+        If a process ends, for want of memory or because a script starts them where each starts its own.
 
     Notes
     -----
@@ -59,6 +61,12 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
     pool = started_processes(cores() if workers is None else workers)
     try:
         yield pool
+    except BrokenExecutor as error:
+        end_processes(pool, at_once=True)
+        raise RuntimeError(
+            'a worker process has ended; in a script start them below if __name__ == "__main__":, else look '
+            "whether they had enough memory."
+        ) from error
     except BaseException:
         end_processes(pool, at_once=True)
         raise

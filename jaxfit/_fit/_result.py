@@ -35,8 +35,8 @@ class Fit(eqx.Module):
         `approximate_stream`, which gives NumPy arrays.
     errors : array (points,), or (n, m) for a grid
         |Q - R(u, v)| of every point, as a fraction of the diagonal of the data's bounding box. They include a
-        bound on the rounding of the control points. They do not include the rounding of evaluating the
-        surface, which is about as large far from the origin.
+        bound on the rounding of the control points (of clouds, outside transformations). They do not include
+        the rounding of evaluating the surface, which is about as large far from the origin.
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
@@ -49,9 +49,9 @@ class Fit(eqx.Module):
         `folds` is their number, inside the loops where the surface is trimmed.
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
-        foot was not found to the tolerance. Of an approximation also `method`, the name of its class, and
-        `tol_average` and `tol_maximum`, infinite where none was given. Of an
-        interpolation also the `tolerance` in force, and of one with symmetry `asymmetry`: the largest
+        foot was not found to the tolerance; `method`, the name of its class. Of an approximation also
+        `tol_average` and `tol_maximum`, infinite where none was given. Of an interpolation also the
+        `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
         Methods add further entries, which their docstrings describe.
     trimmed : TrimmedSurface or None

@@ -25,7 +25,7 @@ def facts(fit: Any) -> dict[str, str]:
     """Names and values for a table: net, order, iterations, errors in per cent, how regular the surface is,
     and why the fit stopped.
     """
-    some = ", without points left out" if _left_out(fit) else ""
+    some = ", without points left out" if left_out(fit) else ""
     return {
         "net": _said_net(fit),
         "order": "{} x {}".format(*fit.surface.order),
@@ -40,9 +40,14 @@ def facts(fit: Any) -> dict[str, str]:
     }
 
 
+def _is_of_cloud(fit: Any) -> bool:
+    """Whether it is an approximation, which alone has tolerances for average and maximum."""
+    return "tol_average" in fit.stats
+
+
 def _said_net(fit: Any) -> str:
     nu, nv = fit.surface.shape
-    surplus = "method" in fit.stats and nu * nv > np.size(fit.errors)
+    surplus = _is_of_cloud(fit) and nu * nv > np.size(fit.errors)
     return f"{nu} x {nv}{', more control points than points' if surplus else ''}"
 
 
@@ -92,7 +97,7 @@ def _cleaning_facts(fit: Any) -> dict[str, str]:
     """How many points were read, and why some were left out."""
     if "points_read" not in fit.stats:
         return {}
-    counts = _left_out(fit)
+    counts = left_out(fit)
     reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items())
     said = {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
     if counts:
@@ -101,8 +106,8 @@ def _cleaning_facts(fit: Any) -> dict[str, str]:
     return said
 
 
-def _left_out(fit: Any) -> dict[str, int]:
-    """How many points, and why."""
+def left_out(fit: Any) -> dict[str, int]:
+    """How many points do not count, by the reason."""
     counts = {name: int(fit.stats.get(key, 0)) for key, name in _LEFT_OUT.items()}
     return {name: count for name, count in counts.items() if count}
 
@@ -169,7 +174,7 @@ def _share_at_border(fit: Any) -> float:
 def with_folds(fit: Any, sentence: str) -> str:
     """The reason for which a fit stopped, and that its surface folds if it does, or was kept from folding."""
     missed = is_single(fit) and not bool(fit.converged)
-    of_cloud = "method" in fit.stats and fit.trimmed is None
+    of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
         sentence = (
             f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "
@@ -185,7 +190,7 @@ def with_folds(fit: Any, sentence: str) -> str:
     if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
     where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
-    folds = f"the surface folds at {where}: {_REMEDIES['method' not in fit.stats]}."
+    folds = f"the surface folds at {where}: {_REMEDIES[not _is_of_cloud(fit)]}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"
@@ -199,7 +204,7 @@ def describe(fit: "Fit") -> str:
     """`str(fit)`: its `facts`, one a line; the shapes of its arrays where it is traced or one of a batch."""
     if not is_single(fit):
         return eqx.tree_pformat(fit)
-    rows = {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)}
+    rows = {"method": str(fit.stats["method"]), **facts(fit)}
     return "\n".join(f"{name:<18}{value}" for name, value in rows.items())
 
 

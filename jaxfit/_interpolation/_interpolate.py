@@ -1,5 +1,6 @@
 """`interpolate`: a surface through all points of a grid."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jaxfit._checks import (
     eager_where_concrete,
     is_concrete,
 )
-from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._fit._result import Fit, Name, converged_or_raise
 from jaxfit._fit._scaling import unit_of
 from jaxfit._interpolation._geometric import GeometricInterpolation
 from jaxfit._interpolation._hermite import NormalInterpolation
@@ -102,6 +103,7 @@ def interpolate(
     check_kind("method", method, AbstractInterpolation, "GeometricInterpolation()")
     normals = method.check_normals(normals, data, order)
     fit = method.fit(_scaled(data, normals, order, tolerance, max_steps), progress)
+    fit = dataclasses.replace(fit, stats={"method": Name(type(method).__name__), **fit.stats})
     return converged_or_raise(fit) if throw else fit
 
 

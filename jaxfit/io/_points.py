@@ -148,6 +148,8 @@ def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
 
 def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
     shape, ndim = ("(n, m, 3)", 3) if key == "grid" else ("(N, 3)", 2)
+    if key == "points" and array.ndim == 2 and len(array) == 3 and array.shape[1] > _LEAST_POINTS:
+        raise InputError(f"{path}: points has shape {array.shape}; it must be (N, 3): store the transpose.")
     array = _coordinates(array, key, ndim, shape, path)
     if array.size < 3 * _LEAST_POINTS:
         raise InputError(

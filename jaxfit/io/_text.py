@@ -8,9 +8,11 @@ from jaxtyping import Float
 
 from jaxfit.io._point_data import InputError
 
+FIRST = 0, 1, 2
+
 
 def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
-    """The first three columns of a text file: commas for .csv, blanks otherwise.
+    """The columns x, y and z of a text file, or the first three: commas for .csv, blanks otherwise.
 
     Raises
     ------
@@ -33,10 +35,11 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
     _check_commas(path, [line for _, line in lines], delimiter, len(names))
+    columns = _columns(names)
     try:
-        values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=(0, 1, 2))
+        values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=columns)
     except ValueError as error:
-        raise InputError(_explain(path, lines, delimiter)) from error
+        raise InputError(_explain(path, lines, delimiter, columns)) from error
     values = values.reshape(-1, 3)
     good = np.isfinite(values).all(axis=1)
     if not good.all():
@@ -45,8 +48,17 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
             f"coordinates, the first in line {lines[int(np.argmin(good))][0]}; remove or repair "
             "them."
         )
-    _check_first_column(path, values[:, 0], len(lines[0][1].split("#")[0].split(delimiter)))
+    if columns == FIRST:
+        _check_first_column(path, values[:, 0], len(lines[0][1].split("#")[0].split(delimiter)))
     return values
+
+
+def _columns(names: list[str]) -> tuple[int, int, int]:
+    """Those named x, y and z, if each is there once, else the first three."""
+    named = [name.strip().strip("\"'").lower() for name in names]
+    if any(named.count(name) != 1 for name in "xyz"):
+        return FIRST
+    return named.index("x"), named.index("y"), named.index("z")
 
 
 def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: int) -> None:
@@ -60,7 +72,7 @@ def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: in
     found = len(cells) > 1 and any(re.fullmatch(r"[+-]?\d*,\d+", cell) for cell in cells)
     if not found and delimiter:
         columns = {len(line.split(delimiter)) for line in lines}
-        suspicious = columns != {named} and (columns == {6} or len(columns) > 1)
+        suspicious = columns != {named} and (columns == {6} or (len(columns) > 1 and min(columns) > 3))
         found = suspicious and not any(re.search(r"[^-+\d,\s]", line) for line in lines)
         remedy += ", or if these are whole numbers, give every line as many and name them in the first"
     if found:
@@ -88,17 +100,19 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _explain(path: Path, lines: list[tuple[int, str]], delimiter: str | None) -> str:
+def _explain(
+    path: Path, lines: list[tuple[int, str]], delimiter: str | None, columns: tuple[int, int, int]
+) -> str:
     """The sentence for the first line that cannot be read (NumPy counts other lines)."""
     for number, line in lines:
         cells = line.split("#")[0].split(delimiter)
-        if len(cells) < 3:
-            hint = "commas" if delimiter else "blanks"
+        if len(cells) <= max(columns):
+            hint, least = "commas" if delimiter else "blanks", max(columns) + 1
             return (
                 f"{path}: line {number} has {len(cells)} column{'s' * (len(cells) != 1)}, but a "
-                f"point has three; separate x, y and z by {hint}."
+                f"point has {'three' if least == 3 else least}; separate x, y and z by {hint}."
             )
-        for cell in cells[:3]:
+        for cell in (cells[column] for column in columns):
             if not _is_number(cell):
                 return f"{path}: line {number} has {cell.strip()!r} in place of a number; mend it."
     return f"{path} is not a table of numbers; write one point a line."

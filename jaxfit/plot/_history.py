@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxfit.plot._part import check_fit
 from jaxfit.plot._picture import blank_figure, save
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ def history(fit: Any, path: str | os.PathLike | None = None, title: str = "", dp
     ------
     ImportError
         If Matplotlib is not installed.
+    TypeError
+        If `fit` is no fit.
 
     Examples
     --------
@@ -42,6 +45,7 @@ def history(fit: Any, path: str | os.PathLike | None = None, title: str = "", dp
     >>> jf.plot.history(fit).get_size_inches().tolist()
     [7.0, 5.2]
     """
+    check_fit(fit)
     figure = blank_figure(7)
     axes = figure.subplots()
     steps = int(fit.stats["num_steps"]) + 1

@@ -14,6 +14,15 @@ from jaxfit._trimmed._trimmed_surface import host_loops, loop_edges
 Ranges = list[tuple[float, float]]
 
 
+def check_fit(fit: Any) -> None:
+    """Raise unless `fit` has the errors of a fit."""
+    if not hasattr(fit, "errors"):
+        raise TypeError(
+            f"fit must be what a fit returned, but is a {type(fit).__name__}; draw surfaces alone by "
+            "zebra_stripes."
+        )
+
+
 def of_fit(fit: Any) -> BSplineSurface | TrimmedSurface:
     """What a picture of a fit shows."""
     trimmed = getattr(fit, "trimmed", None)

@@ -12,7 +12,7 @@ from jaxfit._fit._summary import errors_of_all
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit._trimmed._trimmed_surface import host_loops
 from jaxfit.io._output import check_output, write_atomically
-from jaxfit.plot._part import folds_in, of_fit
+from jaxfit.plot._part import check_fit, folds_in, of_fit
 from jaxfit.plot._render import render
 from jaxfit.plot._view import View
 
@@ -69,7 +69,7 @@ def surface_and_errors(
     ImportError
         If Matplotlib is not installed.
     TypeError
-        If `points` is the name of a file.
+        If `points` is the name of a file, or `fit` is no fit.
     ValueError
         If `points` is a grid whose size is not the number of errors.
 
@@ -80,6 +80,7 @@ def surface_and_errors(
     >>> jf.plot.surface_and_errors(fit, title="a saddle").get_size_inches().tolist()
     [12.0, 5.2]
     """
+    check_fit(fit)
     if isinstance(points, (str, os.PathLike)):
         raise TypeError(f"points must be an array, but is {points!r}; pass a file as path={str(points)!r}.")
     errors = _arrange(fit.errors, points)

@@ -14,10 +14,10 @@ import scipy
 
 from jaxfit._fit._summary import facts
 from jaxfit._version import __version__
-from jaxfit.io._output import write_atomically
+from jaxfit.io._output import check_output, write_atomically
 from jaxfit.plot._history import history
 from jaxfit.plot._loops import loops
-from jaxfit.plot._part import of_fit
+from jaxfit.plot._part import check_fit, of_fit
 from jaxfit.plot._picture import surface_beside_errors
 from jaxfit.plot._zebra import zebra_stripes
 
@@ -68,7 +68,7 @@ def report(
     fit
         A `jaxfit.Fit`.
     path
-        The file, by convention `.html`. It appears whole or not at all, and replaces an older one.
+        The file, `.html` or `.htm`. It appears whole or not at all, and replaces an older one.
     points
         The data, as for `surface_and_errors`.
     title
@@ -80,8 +80,10 @@ def report(
     ------
     ImportError
         If Matplotlib is not installed.
-    OSError
+    ValueError, OSError
         If the file cannot be written.
+    TypeError
+        If `fit` is no fit.
 
     Examples
     --------
@@ -93,9 +95,11 @@ def report(
     >>> "A saddle" in page.read_text()
     True
     """
+    check_fit(fit)
+    check_output(path, (".html", ".htm"))
     rows = {
         **(tables or {}),
-        "Result": {"method": str(fit.stats.get("method", "interpolation")), **facts(fit)},
+        "Result": {"method": str(fit.stats["method"]), **facts(fit)},
     }
     parts = [_table(heading, values) for heading, values in rows.items()]
     parts += [_figures(*pictures) for pictures in _pictures(fit, points)]

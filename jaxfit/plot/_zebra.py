@@ -12,7 +12,7 @@ from jaxfit._quality import regularity
 from jaxfit._quality._zebra import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
-from jaxfit.plot._part import folds_in, whole
+from jaxfit.plot._part import folds_in, of_fit, whole
 from jaxfit.plot._picture import blank_figure, save
 from jaxfit.plot._render import FOLD, coarse_points, render
 from jaxfit.plot._view import View, choose_view, view_from
@@ -45,8 +45,8 @@ def zebra_stripes(
     Parameters
     ----------
     surfaces
-        What to draw, in three dimensions, best in the same place and unit. Of trimmed surfaces only what
-        is inside the loops.
+        What to draw, in three dimensions, best in the same place and unit; also fits. Of trimmed surfaces
+        only what is inside the loops.
     path
         Where to save the picture (.png, .pdf, .svg, ...), whole or not at all; None saves nothing.
     captions
@@ -127,8 +127,9 @@ def _checked(
     surfaces: BSplineSurface | TrimmedSurface | Sequence[BSplineSurface | TrimmedSurface],
     captions: Sequence[str],
 ) -> list[BSplineSurface | TrimmedSurface]:
-    single = isinstance(surfaces, (BSplineSurface, TrimmedSurface))
-    drawn: list[Any] = [surfaces] if single else list(surfaces)  # type: ignore[arg-type]
+    single = isinstance(surfaces, (BSplineSurface, TrimmedSurface)) or hasattr(surfaces, "errors")
+    given: list[Any] = [surfaces] if single else list(surfaces)  # type: ignore[arg-type]
+    drawn = [of_fit(x) if hasattr(x, "errors") else x for x in given]
     if not drawn:
         raise ValueError("surfaces must hold at least one surface, but is empty; give one.")
     for surface in drawn:
