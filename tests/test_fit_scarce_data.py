@@ -87,7 +87,8 @@ def test_control_points_that_rounding_takes_off_the_points_are_told():
     assert fit.converged
     far = near + 1e6
     net = np.asarray(base.control_points, np.float32) + np.float32(1e6)
-    rounded = jf.approximate(far, jf.BSplineSurface(net, base.knots_u, base.knots_v), tol_average=1e-2)
+    knots = [np.asarray(x, np.float32) for x in (base.knots_u, base.knots_v)]
+    rounded = jf.approximate(far, jf.BSplineSurface(net, *knots), tol_average=1e-2)
     assert rounded.result == jf.RESULTS.rounded
     assert not rounded.converged
     assert "until the control points were rounded" in rounded.message

@@ -46,18 +46,21 @@ def tessellate(
 ) -> tuple[Vertices, Triangles]:
     """Vertices on a grid of parameters and triangles between them, whose normals are along R_u x R_v.
 
-    Every span of the knots is cut into the same number of pieces, which is doubled until the triangles are
-    within `deviation` of the surface, as a fraction of the diagonal, halfway along their sides, or until
-    doubling would make more than `most` vertices. Triangles without an area are left out.
+    Each span of the knots of u and of v is cut into pieces, more of them until the triangles are within
+    `deviation` of the surface, as a fraction of the diagonal, halfway along their sides, or until there would
+    be more than `most` vertices. Triangles without an area are left out.
     """
+    breaks = [np.unique(knots) for knots in (net.knots_u, net.knots_v)]
     # At first as many pieces as a polynomial has turns: the middle of an S is on its chord.
-    pieces = max(1, max(net.order) - 2)
-    points = _points(net, pieces)
-    while (2 * points.shape[0] - 1) * (2 * points.shape[1] - 1) <= most:
-        finer = _points(net, 2 * pieces)
-        if _deviation(finer) <= deviation * net.diagonal:
+    pieces = [np.full(len(at) - 1, max(1, max(net.order) - 2)) for at in breaks]
+    while True:
+        finer = _points(net, breaks, [2 * x for x in pieces])
+        too_few = _too_few(finer, pieces, deviation * net.diagonal)
+        following = [np.where(few, 2 * x, x) for few, x in zip(too_few, pieces, strict=True)]
+        if not any(few.any() for few in too_few) or np.prod([x.sum() + 1 for x in following]) > most:
             break
-        pieces, points = 2 * pieces, finer
+        pieces = following
+    points = finer[::2, ::2]
     index = np.arange(points[..., 0].size).reshape(points.shape[:2])
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
     triangles = np.concatenate(
@@ -68,25 +71,30 @@ def tessellate(
     return vertices, triangles[np.cross(q - p, r - p).any(axis=1)]
 
 
-def _points(net: ClampedNet, pieces: int) -> Float[np.ndarray, "a b 3"]:
-    """Points at the knots and at pieces - 1 places between two neighbours."""
+def _points(net: ClampedNet, breaks: list[Any], pieces: list[Any]) -> Float[np.ndarray, "a b 3"]:
+    """Points at the breaks and at pieces - 1 places between two neighbours."""
     matrices = []
-    for knots, order in zip((net.knots_u, net.knots_v), net.order, strict=True):
-        breaks = np.unique(knots)
-        at = np.interp(np.arange(pieces * (len(breaks) - 1) + 1) / pieces, np.arange(len(breaks)), breaks)
-        matrices.append(basis_matrix(knots, order, at))
+    for knots, order, at, counts in zip((net.knots_u, net.knots_v), net.order, breaks, pieces, strict=True):
+        places = [k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]]
+        parameters = np.interp(np.concatenate(places), np.arange(len(at)), at)
+        matrices.append(basis_matrix(knots, order, parameters))
     return along_both(matrices[0], net.control_points, matrices[1])
 
 
-def _deviation(points: Float[np.ndarray, "a b 3"]) -> float:
-    """Distances of the points halfway along the sides of the triangles between every second point."""
+def _too_few(points: Float[np.ndarray, "a b 3"], pieces: list[Any], limit: float) -> list[Any]:
+    """Which spans of u and of v need more pieces: triangles between every second point are farther than
+    `limit` from the points halfway along their sides. Where only the diagonal is, both do.
+    """
     coarse = points[::2, ::2]
-    sides = (
-        (points[1::2, ::2], coarse[:-1], coarse[1:]),
-        (points[::2, 1::2], coarse[:, :-1], coarse[:, 1:]),
-        (points[1::2, 1::2], coarse[:-1, :-1], coarse[1:, 1:]),
-    )
-    return max(float(_distances(*side).max()) for side in sides)
+    along_u = _distances(points[1::2, ::2], coarse[:-1], coarse[1:])
+    along_v = _distances(points[::2, 1::2], coarse[:, :-1], coarse[:, 1:])
+    across = _distances(points[1::2, 1::2], coarse[:-1, :-1], coarse[1:, 1:])
+    starts = [np.concatenate([[0], np.cumsum(x)[:-1]]) for x in pieces]
+    few_u = np.maximum.reduceat(along_u.max(axis=1), starts[0]) > limit
+    few_v = np.maximum.reduceat(along_v.max(axis=0), starts[1]) > limit
+    cells = np.maximum.reduceat(np.maximum.reduceat(across, starts[0], axis=0), starts[1], axis=1) > limit
+    left = cells & ~few_u[:, None] & ~few_v
+    return [few_u | left.any(axis=1), few_v | left.any(axis=0)]
 
 
 def _distances(
