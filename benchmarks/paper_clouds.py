@@ -100,7 +100,7 @@ def figure_4b(report, options):
         average = 100 * np.asarray(fit.history.average)
         at = [k for k in (19, 20, 21, 39, 40, 41, 59, 60, 61, 79, 80, 81, 100) if k < average.size]
         report.row(
-            model=cloud.role,
+            model=f"{cloud.role} ({cloud.source})",
             method=label,
             **{str(k): float(average[k]) for k in at},
             curvature_variation=_variation(fit.surface, _inputs.diagonal(cloud.points)),
@@ -131,7 +131,7 @@ def figures_8_and_10(report, options):
     for name, surface in surfaces.items():
         found = jf.regularity(surface)
         report.row(
-            model=cloud.role,
+            model=f"{cloud.role} ({cloud.source})",
             method=name,
             **judged_surface(surface, cloud.points),
             energy_9=float(found.curvature_energy),

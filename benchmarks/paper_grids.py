@@ -74,8 +74,8 @@ def figure_1(report, options):
     report.table(
         "Figure 1: reflectional symmetry", f"The hood, {WIDTH:g} mm wide, with {NOISE:g} mm of noise."
     )
-    grid = next(iter(_inputs.grids(options.stand_ins))).points
-    grid = grid * (WIDTH / np.ptp(grid[..., 0]))
+    hood = next(iter(_inputs.grids(options.stand_ins)))
+    grid = hood.points * (WIDTH / np.ptp(hood.points[..., 0]))
     noisy = grid + np.random.default_rng(1).normal(scale=NOISE, size=grid.shape)
     reflection = jf.Reflection(0)
     surfaces = []
@@ -84,6 +84,7 @@ def figure_1(report, options):
         net = np.asarray(fit.surface.control_points)
         moved = np.linalg.norm(np.asarray(fit.surface(fit.u, fit.v)) - noisy, axis=-1).max()
         report.row(
+            model=f"{hood.role} ({hood.source})",
             method=caption,
             converged=bool(fit.converged),
             iterations=int(fit.stats["num_steps"]),
@@ -111,7 +112,7 @@ def figure_2(report, options):
         for step in (1, 2, 3, 5, 10, 20, 50, 100):
             if step < len(history.average):
                 report.row(
-                    model=grid.role,
+                    model=f"{grid.role} ({grid.source})",
                     iteration=step,
                     evaluations=float(history.evaluations[step]),
                     change=float(history.change[step]),
