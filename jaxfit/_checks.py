@@ -15,7 +15,8 @@ Scalar = float | np.ndarray | jax.Array
 
 LARGEST = 1e150
 LARGEST_COUNT = 2**31 - 2
-LEAST_STEPS = 1e4  # between which the coordinates of a cloud can choose, along its diagonal
+# Between which the coordinates of a cloud can choose, along its diagonal.
+LEAST_STEPS = {np.dtype(np.float64): 1e4, np.dtype(np.float32): 1e3}
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -151,10 +152,12 @@ def check_magnitude(name: str, x: ArrayLike) -> None:
         )
 
 
-def check_resolution(name: str, low: np.ndarray, high: np.ndarray, diagonal: float) -> None:
-    """Raise if points in the box from `low` to `high` are so far from the origin that float64 blurs them."""
-    steps = diagonal / (np.finfo(np.float64).eps * max(-low.min(), high.max()))
-    if steps < LEAST_STEPS:
+def check_resolution(name: str, low: np.ndarray, high: np.ndarray, diagonal: float, dtype: Any) -> None:
+    """Raise if points in the box from `low` to `high` are so far from the origin that their `dtype` blurs
+    them."""
+    dtype = dtype if dtype in LEAST_STEPS else np.dtype(np.float64)
+    steps = diagonal / (float(np.finfo(dtype).eps) * max(-low.min(), high.max()))
+    if steps < LEAST_STEPS[dtype]:
         raise ValueError(
             f"{name} must differ by more than the rounding of their coordinates, but the diagonal of their "
             f"bounding box is only {steps:.3g} units of it; subtract their centre before they are rounded."

@@ -147,7 +147,7 @@ def _add_fit_options(parser: argparse.ArgumentParser) -> None:
 def _pair(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
     if match is None:
-        raise argparse.ArgumentTypeError(f"{text!r} is no pair of counts such as 62x57")
+        raise argparse.ArgumentTypeError(f"{text!r} is no pair of counts such as 8x6")
     return int(match[1]), int(match[2])
 
 

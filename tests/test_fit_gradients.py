@@ -175,7 +175,9 @@ def test_a_derivative_far_from_rest_is_refused(method):
         options = dict(max_steps=1, method=method)
         return jax.grad(height_of, argnums=(0, 1))(POINTS, WEIGHTS, adjoint, **options)[0]
 
-    with pytest.raises(ArithmeticError, match=r"not at rest .* pass a number as smoothing"):
+    with pytest.raises(
+        ArithmeticError, match=r"not at rest .* OrthogonalDistance with a number as smoothing"
+    ):
         slope(jf.ImplicitAdjoint(polish_steps=0))
     np.testing.assert_allclose(slope(jf.ImplicitAdjoint()), slope(None), rtol=1e-9, atol=1e-12)
 

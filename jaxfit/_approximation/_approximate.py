@@ -58,7 +58,8 @@ def approximate(
     start : pair of arrays (points,), optional
         Feet (u, v) on the base surface to start from; default the closest points, searched globally.
     progress : callable, optional
-        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations.
+        Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
+        errors are fractions of the diagonal.
         Without it a line in the terminal (which takes rich) or the notebook says what is done, once that
         takes more than 3 s; ``off`` in the environment variable `JAXFIT_PROGRESS` shows none.
     throw : bool

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._checks import as_points, check_number, is_concrete
+from jaxfit._fit._scaling import unit_of
 from jaxfit._scan import is_nodata
 
 
@@ -63,7 +64,10 @@ def _points_with_gaps(points: Any) -> np.ndarray:
     if isinstance(array, np.ndarray) and array.dtype.kind == "f":
         gaps = ~np.isfinite(array)
         array = np.where(gaps, 0.0, array)
-    checked = np.asarray(as_points("points", array, 3, least=LEAST_POINTS), float)
+    typed = as_points("points", array, 3, least=LEAST_POINTS)
+    if not gaps.any():
+        unit_of(typed)  # which looks at their precision
+    checked = np.asarray(typed, float)
     return np.where(gaps, np.nan, checked) if gaps.any() else checked
 
 

@@ -176,8 +176,8 @@ def fit_points(
     fixed, known = without_derivatives((cloud, options))
     if not is_concrete(fixed):
         raise TypeError(
-            "points must be concrete, but are traced; call fit_points outside jit and vmap, or make the base "
-            "surface outside and call approximate inside."
+            "points must be concrete, but are traced; call fit_points outside jit and vmap, or make a base "
+            "surface outside and call approximate(points, base) inside."
         )
     checked_request(fixed, method=without_derivatives(method), **known)
     if net is None and _may_grow(fixed, method, known):

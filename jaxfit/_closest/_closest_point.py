@@ -161,7 +161,7 @@ def closest_point(
     ([0.25, 1.0], [0.5, 0.5], [2.0, 2.0])
     """
     method = Newton() if method is None else method
-    check_kind("surface", surface, (BSplineSurface, BSplineCurve), "BSplineSurface(...)")
+    check_kind("surface", surface, (BSplineSurface, BSplineCurve), "fit.surface")
     check_kind("method", method, AbstractFootMethod, "Newton()")
     check_number("max_steps", max_steps, 1, whole=True)
     if tolerance is not None:

@@ -94,7 +94,7 @@ def unit_of(points: Any, name: str = "points") -> Unit:
     Raises ValueError, naming the argument, if all points coincide or are out of range.
     """
     if is_concrete(points):
-        points = np.asarray(points, np.float64)
+        given, points = np.asarray(points).dtype, np.asarray(points, np.float64)
         # Along rows of memory: across them NumPy takes ten times as long.
         columns = np.ascontiguousarray(points.T)
         low, high = columns.min(axis=1), columns.max(axis=1)
@@ -116,7 +116,7 @@ def unit_of(points: Any, name: str = "points") -> Unit:
                 f"{name} must keep to the range of {info.dtype} in size, but the bounding box has the "
                 f"diagonal {diagonal:.3g}; choose another unit of length."
             )
-        check_resolution(name, low, high, diagonal)
+        check_resolution(name, low, high, diagonal, given)
         return Unit(0.5 * (low + high), 2.0 ** round(np.log2(diagonal)), diagonal)
     low, high = jnp.min(points, axis=0), jnp.max(points, axis=0)
     diagonal = jnp.linalg.norm(high - low)

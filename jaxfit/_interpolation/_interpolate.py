@@ -57,7 +57,7 @@ def interpolate(
         Most iterations (of `StandardInterpolation`, cycles of GMRES; `NormalInterpolation` has none).
     progress : callable, optional
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
-        only by `GeometricInterpolation`; the others are done in one go.
+        errors are fractions of the diagonal. Only by `GeometricInterpolation`; the others are done in one go.
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
     normals : array (n, m, 3), optional

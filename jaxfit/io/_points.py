@@ -140,10 +140,10 @@ def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.suffix.lower() not in suffixes:
         raise InputError(
             f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, "
-            f"which says too little about what is in it; use one of {', '.join(suffixes)}."
+            f"so its format is not known; use one of {', '.join(suffixes)}."
         )
     if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty; write it again.")
+        raise InputError(f"{path} is empty; give a file with points.")
 
 
 def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:

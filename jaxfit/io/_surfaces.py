@@ -91,6 +91,11 @@ def write_surface(
     >>> jf.io.read_surface(path)(0.5, 0.5).tolist()
     [0.5, 0.5, 0.25]
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"path must be the name of a file, but is a {type(path).__name__}; pass the name first, then the "
+            "surface."
+        )
     check_output(path)
     if isinstance(surface, Fit):
         surface = surface.surface if surface.trimmed is None else surface.trimmed

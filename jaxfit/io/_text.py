@@ -72,7 +72,7 @@ def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: in
     found = len(cells) > 1 and any(re.fullmatch(r"[+-]?\d*,\d+", cell) for cell in cells)
     if not found and delimiter:
         columns = {len(line.split(delimiter)) for line in lines}
-        suspicious = columns != {named} and (columns == {6} or (len(columns) > 1 and min(columns) > 3))
+        suspicious = columns != {named} and (columns == {6} or (len(columns) > 1 and min(columns) >= 3))
         found = suspicious and not any(re.search(r"[^-+\d,\s]", line) for line in lines)
         remedy += ", or if these are whole numbers, give every line as many and name them in the first"
     if found:
