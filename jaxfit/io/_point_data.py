@@ -79,8 +79,8 @@ class PointData:
         cloud = self.cloud
         if len(cloud) != n * m:
             raise InputError(
-                f"the {len(cloud):,} points of {self.name} do not make a {n} x {m} grid of {n * m:,}; give the "
-                "grid's true size."
+                f"{self.name} holds {len(cloud)} points, which do not make a {n} x {m} grid of "
+                f"{n * m}; give the grid's true size."
             )
         return dataclasses.replace(grid_data(cloud.reshape(n, m, 3), self.name), left_out=self.left_out)
 
