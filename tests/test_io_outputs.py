@@ -105,6 +105,20 @@ def test_a_span_that_is_an_s_is_cut_into_pieces():
     )
 
 
+def test_each_span_has_as_many_pieces_as_it_needs():
+    from jaxfit.io._nets import clamped_net
+    from jaxfit.io._tessellation import tessellate
+
+    x, y = np.meshgrid(np.linspace(0, 1, 30), np.linspace(0, 1, 25), indexing="ij")
+    bump = np.exp(-(((x - 0.2) / 0.05) ** 2))  # along u only, and at one place
+    surface = jf.interpolate(np.stack([x, y, 0.1 * bump], axis=-1), jf.StandardInterpolation()).surface
+    vertices, triangles = tessellate(clamped_net(surface))
+    spans_u, spans_v = 27, 22
+    assert len(np.unique(vertices[:, 1].round(9))) == 2 * spans_v + 1  # the fewest pieces along v
+    assert len(vertices) < 6 * spans_u * (2 * spans_v + 1)
+    assert len(triangles) == 2 * (len(vertices) // (2 * spans_v + 1) - 1) * 2 * spans_v
+
+
 def test_a_pole_makes_no_triangle_without_area():
     from jaxfit.io._nets import clamped_net
     from jaxfit.io._tessellation import tessellate
