@@ -69,6 +69,12 @@ def test_a_picture_of_an_unknown_format_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("picture", [surface_and_errors, history, loops])
+def test_a_surface_where_a_fit_is_drawn_is_told(picture):
+    with pytest.raises(TypeError, match="fit must be what a fit returned, but is a BSplineSurface; draw"):
+        picture(wavy_surface())
+
+
 def test_no_global_state_is_touched():
     surface_and_errors(fake_fit((50,)))
     assert "matplotlib.pyplot" not in sys.modules

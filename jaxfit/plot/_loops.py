@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxfit._trimmed._area import knot_lines
+from jaxfit.plot._part import check_fit
 from jaxfit.plot._picture import blank_figure, draw_loops, save
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi:
     ------
     ImportError
         If Matplotlib is not installed.
+    TypeError
+        If `fit` is no fit.
 
     Examples
     --------
@@ -45,6 +48,7 @@ def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi:
     >>> jf.plot.loops(fit).get_size_inches().tolist()
     [7.0, 5.2]
     """
+    check_fit(fit)
     figure = blank_figure(7)
     axes = figure.subplots()
     for lines, draw in zip(knot_lines(fit.surface), (axes.axvline, axes.axhline), strict=True):
