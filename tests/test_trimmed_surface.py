@@ -222,3 +222,11 @@ def test_finer_triangles_come_closer_to_the_area():
     assert mesh.triangles.dtype.kind == "i"
     with pytest.raises(ValueError, match=r"deviation must be positive.*\.$"):
         trimmed.tessellate(0.0)
+
+
+def test_a_loop_closed_but_for_rounding_is_refused():
+    angle = np.linspace(0, 2 * np.pi, 41)
+    circle = np.stack([0.5 + 0.4 * np.cos(angle), 0.5 + 0.4 * np.sin(angle)], axis=1)
+    assert (circle[0] != circle[-1]).any()
+    with pytest.raises(ValueError, match="vertices 40 and 0 are the same; remove one"):
+        jf.TrimmedSurface(wavy_surface(), (circle,))
