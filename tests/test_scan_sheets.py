@@ -6,7 +6,7 @@ from helpers import data
 
 from jaxfit._scan import _sheet_mesh, sheet_of
 from jaxfit._scan._cleaning import cleaned
-from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces
+from jaxfit._scan._manifold import areas, boundary_loops, manifold, pieces, single_fans
 
 pytest.importorskip("shapely")
 
@@ -249,3 +249,11 @@ def test_faces_of_a_large_file_tell_sheets_apart_that_are_nearer_than_the_nodes(
 def test_points_all_over_the_place_are_no_sheet(count):
     with pytest.raises(ValueError, match="points must"):
         sheet_of(np.random.default_rng(0).normal(size=(count, 3)))
+
+
+def test_triangles_that_touch_at_a_point_only_are_left_out():
+    """As those of given faces do where longer ones between them are left out."""
+    faces = np.array([[0, 1, 2], [0, 3, 4], [0, 4, 5]])
+    kept = single_fans(faces)
+    np.testing.assert_array_equal(kept, faces[1:])
+    assert [sorted(loop) for loop in boundary_loops(kept)] == [[0, 3, 4, 5]]

@@ -21,10 +21,10 @@ def manifold(candidates: Faces) -> Faces:
         if taken.isdisjoint(edges):
             taken.update(edges)
             kept.append(number)
-    return _single_fans(candidates[kept])
+    return single_fans(candidates[kept])
 
 
-def _single_fans(faces: Faces) -> Faces:
+def single_fans(faces: Faces) -> Faces:
     """Without all but the largest fan of triangles at each vertex."""
     while len(faces):
         fan = fans(faces)

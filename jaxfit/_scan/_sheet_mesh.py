@@ -11,7 +11,7 @@ from jaxfit._scan._even_choice import even_choice
 from jaxfit._scan._flat_places import flat_places
 from jaxfit._scan._hole_filling import filled_holes
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
-from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces
+from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces, single_fans
 from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
 from jaxfit._scan._node_gradients import carried_places
 from jaxfit._scan._node_normals import area_without_noise
@@ -91,7 +91,7 @@ def _from_faces(
 ) -> tuple[SheetMesh, float]:
     """The mesh of given faces, with nodes chosen where there are too many points."""
     if length is not None:
-        faces = faces[longest_edges(cloud, faces) <= length]
+        faces = single_fans(faces[longest_edges(cloud, faces) <= length])  # or pieces may touch at a point
     closed, region = length, None
     if len(nodes) < len(cloud):
         faces, region = coarse_faces(cloud, faces, chosen)
