@@ -97,8 +97,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        said = {**read_from, "net": "", "order": "", "tolerances": "", **facts(done.fit)}
-        print_table({**said, "tolerances": done.tolerances, **outcome})
+        print_table({**read_from, **facts(done.fit), "tolerances": done.tolerances, **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 

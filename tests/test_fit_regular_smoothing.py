@@ -7,6 +7,7 @@ from helpers import clamped_uniform, data, diagonal, grid_edges, wavy_cloud, wav
 
 import jaxfit as jf
 from jaxfit._approximation._folds import folds_by_cell, near_folds
+from jaxfit._approximation._regular_smoothing import FoldGuard
 from jaxfit._normal_equations import Roughness
 from jaxfit._splines._pieces import make_pieces
 
@@ -154,3 +155,32 @@ def test_room_for_new_knots_changes_no_fit_before_they_are_there(border):
     assert fits[1].surface.shape > base.shape
     first, second = (np.asarray(fit.history.average)[:5] for fit in fits)
     np.testing.assert_allclose(second, first, rtol=1e-4)
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time(late):
+    smoothing, order = jf.RegularSmoothing(), (4, 4)
+    least, nothing = jnp.full((7, 6), smoothing.least), jnp.zeros((7, 6))
+    for floor in (least, least.at[3, 3].set(8.0)):
+        guard = FoldGuard(floor, floor, nothing, nothing, jnp.zeros((4, 3)))
+        after = smoothing.after(guard, guard, jnp.array(True), jnp.array(True), order, jnp.array(late))
+        if late and floor is not least:
+            np.testing.assert_array_equal(after.factor, 0.5 * smoothing.first)
+            np.testing.assert_array_equal(after.floor, smoothing.least)
+        else:
+            np.testing.assert_array_less(after.factor, 8.0)
+
+
+def test_a_fit_that_ends_early_is_not_smoothed_once_more():
+    points, _ = pocketed()
+    base = jf.base_surface(
+        jf.Boundary.from_grid(sheet(*np.meshgrid(*2 * [np.linspace(0, 1, 33)], indexing="ij"))), net=(12, 12)
+    )
+    averages = [
+        np.asarray(jf.approximate(points, base, tol_average=1e-6, max_steps=steps).history.average)
+        for steps in (30, 40)
+    ]
+    assert averages[0].size == 31
+    np.testing.assert_allclose(averages[0][:26], averages[1][:26], rtol=1e-6)
+    assert averages[0][26] < 1.01 * averages[0][25]
+    assert averages[1][26] > 1.01 * averages[1][25]

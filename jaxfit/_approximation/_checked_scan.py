@@ -65,8 +65,8 @@ def _points_with_gaps(points: Any) -> np.ndarray:
         gaps = ~np.isfinite(array)
         array = np.where(gaps, 0.0, array)
     typed = as_points("points", array, 3, least=LEAST_POINTS)
-    if not gaps.any():
-        unit_of(typed)  # which looks at their precision
+    if (whole := ~gaps.any(axis=-1)).any():
+        unit_of(typed[whole])  # which looks at their precision
     checked = np.asarray(typed, float)
     return np.where(gaps, np.nan, checked) if gaps.any() else checked
 

@@ -261,13 +261,11 @@ _DEFAULTS = {
 }
 
 
-_OWN = "boundary net order method base faces hole_length".split()
-
-
 def _check_names(options: dict[str, Any]) -> None:
     for name in options:
         if name in ("degree", "degrees"):
             raise TypeError(f"{name} is not an option of fit_points; pass order, degree + 1 along u and v.")
         if name not in _DEFAULTS:
-            names = ", ".join([*_OWN, *_DEFAULTS])
+            own = list(inspect.signature(fit_points).parameters)[1:-1]
+            names = ", ".join([*own, *_DEFAULTS])
             raise TypeError(f"{name} is not an option of fit_points; pass any of {names}.")

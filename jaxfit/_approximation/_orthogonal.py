@@ -25,7 +25,13 @@ from jaxfit._approximation._distance_rows import normal_equations
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
-from jaxfit._approximation._regular_smoothing import SETTLED_AT, FoldGuard, RegularSmoothing
+from jaxfit._approximation._regular_smoothing import (
+    LEAST_STEPS,
+    RENEWED_AT,
+    SETTLED_AT,
+    FoldGuard,
+    RegularSmoothing,
+)
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
     as_smoothing,
@@ -193,7 +199,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     @property
     def stall_since(self) -> int:
-        """The first iteration, or the one from which on `RegularSmoothing` smooths no more."""
+        """The first iteration; with `RegularSmoothing` the one by which its second smoothing has faded."""
         return SETTLED_AT if isinstance(self.smoothing, RegularSmoothing) else 0
 
     @property
@@ -243,7 +249,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         guard = state.guard
         if guard is not None:
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
-            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, new.step)
+            late = (new.step == RENEWED_AT) & (problem.tolerances.max_steps >= LEAST_STEPS)
+            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, late)
         # A step that folds is taken again with more smoothing there, not with more damping everywhere.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))

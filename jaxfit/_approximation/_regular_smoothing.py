@@ -26,8 +26,10 @@ STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
 FLOOR_FALL = 0.95  # at once: it falls by this with every accepted step
 # After so many iterations, where folds had to be kept out, the surface is smoothed once more, from this share
-# of the first factor: what was caught in a bad place is then free to settle in a better one.
+# of the first factor: what was caught in a bad place is then free to settle in a better one. Not where the
+# fit would end before that has faded again.
 RENEWED_AT, RENEWED = 25, 0.5
+LEAST_STEPS = RENEWED_AT + 15
 SETTLED_AT = RENEWED_AT + 5  # errors that rise with the factors are none to compare later ones with
 
 
@@ -56,8 +58,9 @@ class RegularSmoothing(eqx.Module):
     surface without folds remains so on the samples: 8 in each direction of a cell, whose normals
     may turn by 60 degrees from one to the next. Points that ask for a fold remain far away. A part of the
     surface that folds were kept out of may be caught: too far from its points to follow them with the
-    smoothing that their distances cause. So after 25 iterations, if folds were kept out anywhere, all factors
-    rise once more, to half of `first`, and what has been raised around folds is forgotten.
+    smoothing that their distances cause. So after 25 iterations, if folds were kept out anywhere and the fit
+    may take 40, all factors rise once more, to half of `first`, and what has been raised around folds is
+    forgotten.
 
     Parameters
     ----------
@@ -139,9 +142,10 @@ class RegularSmoothing(eqx.Module):
         return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 
     def after(
-        self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any, step: Array
+        self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any, late: Array
     ) -> "FoldGuard":
-        """The factors after this `step`: `better` if its objective is lower, `good` if also accepted."""
+        """The factors after a step: `better` if its objective is lower, `good` if also accepted, `late` if it
+        is time to smooth once more."""
         fresh = near_folds(jnp.maximum(new.folds - old.folds, 0.0), order) & better & ~good
         kept = near_folds(jnp.minimum(new.folds, old.folds), order) & good
         factor, floor, holds, held = jax.tree.map(jnp.asarray, (new.factor, new.floor, new.holds, new.held))
@@ -150,9 +154,9 @@ class RegularSmoothing(eqx.Module):
         factor = lax.select(good, jnp.maximum(self.fall * factor, floor), factor)
         factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
-        renewed = (step == RENEWED_AT) & jnp.any(floor > self.least)
-        factor = jnp.where(renewed, jnp.maximum(factor, RENEWED * self.first), factor)
-        floor = jnp.where(renewed, self.least, floor)
+        again = late & jnp.any(floor > self.least)
+        factor = jnp.where(again, jnp.maximum(factor, RENEWED * self.first), factor)
+        floor = jnp.where(again, self.least, floor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
         held = lax.select(fresh, holds, jnp.maximum(held - good, 0.0))
         return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))

@@ -61,14 +61,13 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
     pool = started_processes(cores() if workers is None else workers)
     try:
         yield pool
-    except BrokenExecutor as error:
+    except BaseException as error:
         end_processes(pool, at_once=True)
-        raise RuntimeError(
-            'a worker process has ended; in a script start them below if __name__ == "__main__":, else look '
-            "whether they had enough memory."
-        ) from error
-    except BaseException:
-        end_processes(pool, at_once=True)
+        if isinstance(error, BrokenExecutor):
+            raise RuntimeError(
+                'a worker process has ended; in a script start them below if __name__ == "__main__":, else '
+                "look whether they had enough memory."
+            ) from error
         raise
     end_processes(pool)
 

@@ -57,7 +57,9 @@ def _said_iterations(fit: Any) -> str:
 
 
 def _tolerance_facts(fit: Any) -> dict[str, str]:
-    """What the fit of a cloud aimed at, in per cent: whoever passed per cent as a fraction sees it here."""
+    """What the fit aimed at, in per cent: whoever passed per cent as a fraction sees it here."""
+    if "tolerance" in fit.stats:  # of an interpolation
+        return {"tolerances": f"maximum {100 * float(fit.stats['tolerance']):.4g} %"}
     goals = [fit.stats.get(f"tol_{name}") for name in ("average", "maximum")]
     if any(goal is None for goal in goals):
         return {}

@@ -86,6 +86,8 @@ class Passes:
         `surface` is the iterate's in the user's unit. With `search` feet are searched on it anew.
         """
 
+        rounding = float(self.unit.loss(np.asarray(surface.control_points)))
+
         def one(block: tuple[int, Points]) -> tuple[float, float, int]:
             start, points = block
             here, _ = self._measured(start, points, iterate, np.asarray(True), surface if search else None)
@@ -94,7 +96,7 @@ class Passes:
             known = u, v, error * self.unit.scale, converged
             found = errors.feet(surface, _padded(points, self.size), known, self.method.finds_feet)
             u, v, distance, converged = (np.asarray(x)[: len(points)] for x in found)
-            relative = distance.astype(np.float64) / self.unit.diagonal
+            relative = distance.astype(np.float64) / self.unit.diagonal + rounding
             self.feet.finish(start, u, v, relative)
             if self.weights is not None:
                 relative = np.where(self.weights[start : start + len(points)] > 0, relative, 0.0)

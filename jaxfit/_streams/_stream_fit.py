@@ -11,6 +11,7 @@ import numpy as np
 from jaxfit._approximation._checked_arguments import check_options, checked_start, checked_weights
 from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
+    code_with_rounding,
     fitted_surface,
     stats_of,
     tolerances_of,
@@ -58,6 +59,8 @@ def fit_stream(
     lost = int(loop.code) == code_of(RESULTS.diverged)  # the stored feet are those of a surface given up
     errors = GlobalFeet() if request["errors"] is None else request["errors"]
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
+    code = code_with_rounding(loop.code, average, maximum, passes.tolerances)
+    loop = eqx.tree_at(lambda x: x.code, loop, code)
     known = stats_of(method, passes.tolerances, loop.current.step, unit, unconverged)
     stats = known | {"passes": passes.made + 1} | stats  # with the first, which finds the unit
     fit = _fit(loop, passes.feet, surface, average, maximum, stats, getattr(method, "fairing", None))

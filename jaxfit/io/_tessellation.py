@@ -53,14 +53,13 @@ def tessellate(
     breaks = [np.unique(knots) for knots in (net.knots_u, net.knots_v)]
     # At first as many pieces as a polynomial has turns: the middle of an S is on its chord.
     pieces = [np.full(len(at) - 1, max(1, max(net.order) - 2)) for at in breaks]
-    while True:
+    while np.prod([2 * x.sum() + 1 for x in pieces]) <= most:
         finer = _points(net, breaks, [2 * x for x in pieces])
         too_few = _too_few(finer, pieces, deviation * net.diagonal)
-        following = [np.where(few, 2 * x, x) for few, x in zip(too_few, pieces, strict=True)]
-        if not any(few.any() for few in too_few) or np.prod([x.sum() + 1 for x in following]) > most:
+        if not any(few.any() for few in too_few):
             break
-        pieces = following
-    points = finer[::2, ::2]
+        pieces = [np.where(few, 2 * x, x) for few, x in zip(too_few, pieces, strict=True)]
+    points = _points(net, breaks, pieces)
     index = np.arange(points[..., 0].size).reshape(points.shape[:2])
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]
     triangles = np.concatenate(
