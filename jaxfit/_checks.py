@@ -63,6 +63,8 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
         raise TypeError(
             f"{name} must be an array, but is {os.fspath(x)!r}; read a file by jaxfit.io.read_points."
         )
+    if hasattr(x, "cloud") and hasattr(x, "grid"):
+        raise TypeError(f"{name} must be an array, but is a {type(x).__name__}; pass its .cloud or .grid.")
     if isinstance(array, np.ma.MaskedArray):
         array = unmasked(name, array)
     if not isinstance(array, (np.ndarray, jax.Array)):
@@ -92,10 +94,18 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
 def _as_wanted(name: str, shape: tuple[int, ...], ndim: int) -> str:
     """What to do with an array whose number of dimensions is wrong: grids and clouds are often mixed up."""
     if len(shape) == 3 and ndim == 2:
+        if has_coordinates_first(shape):
+            turned = f"np.moveaxis({name}, 0, -1)"
+            return f"pass {name}.reshape({shape[0]}, -1).T, or interpolate {turned} if it is a grid of data"
         return f"pass {name}.reshape(-1, {shape[2]}), or interpolate it if it is a grid of data"
     if len(shape) == 2 and ndim == 3 and name == "grid":
         return "reshape it to (n, m, d) if its points stand row by row, or fit them by fit_points as a cloud"
     return "reshape it"
+
+
+def has_coordinates_first(shape: tuple[int, ...]) -> bool:
+    """Whether an array (n, m, d) has the shape of a grid whose coordinates were stacked along axis 0."""
+    return shape[0] in (2, 3) and shape[2] > 3
 
 
 def unmasked(name: str, x: np.ma.MaskedArray) -> np.ndarray:
@@ -221,13 +231,14 @@ def _check_multiplicity(name: str, knots: np.ndarray, order: int, count: int) ->
 
 
 def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
-    """Raise unless `value` is an instance of `kind`; `example` says what to pass."""
+    """Raise unless `value` is an instance of `kind`; `example` says what to pass, one or several."""
     if not isinstance(value, kind):
-        given = f"a {type(value).__name__}"
+        given = f"the string {value!r}" if isinstance(value, str) else f"a {type(value).__name__}"
         if isinstance(value, type):
             given = f"the class {value.__name__}"
             example = f"{value.__name__}()" if issubclass(value, kind) else example
-        raise TypeError(f"{name} must be an object such as {example}, but is {given}; pass {example}.")
+        wanted = "one of these" if " or " in example else example
+        raise TypeError(f"{name} must be an object such as {example}, but is {given}; pass {wanted}.")
 
 
 def check_switches(owner: Any, names: tuple[str, ...]) -> None:

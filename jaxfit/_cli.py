@@ -18,11 +18,10 @@ from jaxfit._cli_page import write_page
 from jaxfit._cli_report import as_sentence, print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
 from jaxfit._fit._summary import facts
+from jaxfit.io._output import PICTURES
 
 REACHED, NOT_REACHED, BAD_INPUT, FAILED = 0, 1, 2, 3
 INTERRUPTED = _interrupt.EXIT_CODE
-
-_PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -123,7 +122,7 @@ def _check_files(args: argparse.Namespace) -> str | None:
     if not drawable:
         return None
     picture = args.picture or str(Path(args.output).with_suffix(".png"))
-    io.check_output(picture, _PICTURES)
+    io.check_output(picture, PICTURES)
     return picture
 
 

@@ -22,7 +22,11 @@ def batch_command(args: argparse.Namespace) -> int:
         _fit_all(args, left, table)
         table.sort(job.row["input"] for job in jobs)
         table.write()
+    again = {job.row["input"] for job in left}
     rows = [table.rows[job.row["input"]] for job in jobs]
+    for row in rows:
+        if row["status"] == FAILED and row["input"] not in again:
+            print(f"jaxfit: error: {_with_name(row)} (In an earlier run.)", file=sys.stderr)
     if not args.quiet:
         _summarise(rows, len(jobs) - len(left), table)
     return max(_CODES[row["status"]] for row in rows)
@@ -82,4 +86,6 @@ def _with_name(row: Row) -> str:
 def _summarise(rows: list[Row], before: int, table: Table) -> None:
     counts = [(name, sum(row["status"] == name for row in rows)) for name in _CODES]
     said = ", ".join(f"{count} {name}" for name, count in counts if count)
-    print(f"{len(rows)} files ({before} done before): {said}; see {table.sheet}")
+    retry = before and any(row["status"] == FAILED for row in rows)
+    advice = "; --retry-failed fits the failed ones again" if retry else ""
+    print(f"{len(rows)} files ({before} done before): {said}; see {table.sheet}{advice}")

@@ -20,7 +20,8 @@ import jaxfit as jf
 from jaxfit import _cli
 from jaxfit._approximation._smoothing_term import check_smoothing
 from jaxfit._checks import as_floating, check_number
-from jaxfit.io import InputError, read_points, read_surface, write_surface
+from jaxfit._fit._border import check_border
+from jaxfit.io import InputError, PointData, read_points, read_surface, write_surface
 
 GRID = wavy_grid(8, 7)
 POINTS, EDGES = wavy_cloud(60)
@@ -256,6 +257,9 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         (lambda: jf.OrthogonalDistance(smoothing="auto"), r"or RegularSmoothing\(\)"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, net=(65, 64)), "at most 4,096 control points for 60 points"),
         (lambda: jf.fit_points(POINTS, net=(65, 64)), "at most 4,096 control points for 60 points"),
+        (lambda: jf.interpolate(np.moveaxis(GRID, 2, 0)), r"pass np.moveaxis\(grid, 0, -1\)"),
+        (lambda: jf.fit_points(np.moveaxis(GRID, 2, 0), BOUNDARY), r"pass points.reshape\(3, -1\).T"),
+        (lambda: jf.interpolate(PointData(POINTS, None, None, "a")), "a holds 60 scattered points; fit"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, tol_average=6), "must be at most 1, .* 6e-4 for 0.06 %"),
         (lambda: jf.fit_points((POINTS + 5e6).astype(np.float32), BOUNDARY), "before they are rounded"),
         (lambda: jf.fit_points((POINTS + 5e6).astype(np.float32)), "before they are rounded"),
@@ -279,7 +283,15 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
         (lambda: inspect.unwrap(as_floating)("grid", CHECKOUT, 3), "read a file by jaxfit.io.read_points"),
         (
             lambda: inspect.unwrap(jf.fit_points)(POINTS, BOUNDARY, base="meshless"),
-            "base must be an object such as Coons",
+            r"such as Coons\(\) or Meshless\(\), but is the string 'meshless'; pass one of these",
+        ),
+        (
+            lambda: inspect.unwrap(check_border)("free"),
+            r"FixedCorners\(\), FixedSides.* FreeBorder.* 'free'; ",
+        ),
+        (
+            lambda: inspect.unwrap(as_floating)("points", PointData(POINTS, None, None, "a"), 2),
+            "points must be an array, but is a PointData; pass its .cloud or .grid",
         ),
         (lambda: jf.fit_points(POINTS, BOUNDARY, degree=3), "degree is not an option .* pass order"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, nett=3), "pass any of boundary, net, order, method, base"),

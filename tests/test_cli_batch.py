@@ -75,7 +75,10 @@ def test_bad_files_are_reported_and_passed_over(folder, capsys):
     before = state()  # a second run does nothing
     assert batch(BAD[0], *GOOD, *BAD[1:]) == 3
     assert state() == before
-    assert capsys.readouterr().err == ""
+    assert capsys.readouterr().err.splitlines() == [f"{line} (In an earlier run.)" for line in said]
+    assert _cli.main(["batch", *GOOD, *BAD, "-o", "out", *(x for x in OPTIONS if x != "--quiet")]) == 3
+    shown = capsys.readouterr().out
+    assert "3 failed; see out/table.csv; --retry-failed fits the failed ones again" in shown
 
 
 def test_folds_are_those_inside_the_loops(folder, monkeypatch):

@@ -223,6 +223,15 @@ def test_a_smooth_cloud_is_met_and_errors_are_distances_to_closest_points(base):
     assert fit.history.average[-1] < 0.2 * fit.history.average[0]
 
 
+def test_a_base_that_meets_the_tolerances_is_returned_and_said_to_be_it(base):
+    fit = jf.approximate(POINTS, base, jf.StandardApproximation(smoothing=1.0), tol_average=0.5)
+    assert int(fit.stats["num_steps"]) == 0
+    assert np.allclose(fit.surface.control_points, base.control_points, rtol=0, atol=10 * eps())
+    assert fit.message.startswith("all tolerances are met by the base surface, which is returned; lower")
+    closer = jf.approximate(POINTS, base, tol_average=6e-4)
+    assert closer.message == "all tolerances are met."
+
+
 def test_held_and_untouched_control_points_keep_every_bit(base):
     surface = base.affine(np.eye(3), np.array([0.1, 0.2, 0.3]))
     some = POINTS[(POINTS[:, 0] < 0.3) & (POINTS[:, 1] < 0.4)] + np.array([0.1, 0.2, 0.3])

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from helpers import data, grid_edges, wavy_cloud, wavy_grid
 
-from jaxfit.io import InputError, jacksboro, read_boundary, read_points
+import jaxfit as jf
+from jaxfit import Boundary
+from jaxfit.io import InputError, PointData, jacksboro, read_boundary, read_points
 
 POINTS = np.arange(24.0).reshape(8, 3) ** 1.5
 
@@ -64,6 +66,19 @@ def test_npz_with_a_grid_has_its_edges_as_boundary(tmp_path):
     np.testing.assert_array_equal(read.cloud, grid.reshape(-1, 3))
     for side, polyline in grid_edges(grid).items():
         np.testing.assert_allclose(getattr(read.boundary, side), polyline, atol=1e-12)
+
+
+def test_what_was_read_is_fitted_as_it_is():
+    grid = wavy_grid(8, 7)
+    edges = Boundary.from_grid(grid)
+    read = PointData(points=None, grid=grid, boundary=edges, name="waves")
+    net = np.asarray(jf.interpolate(read, jf.StandardInterpolation()).surface.control_points)
+    np.testing.assert_array_equal(
+        net, jf.interpolate(grid, jf.StandardInterpolation()).surface.control_points
+    )
+    base = jf.base_surface(edges, net=(6, 6))
+    fits = [jf.approximate(x, base, max_steps=0) for x in (read, grid.reshape(-1, 3))]
+    np.testing.assert_array_equal(fits[0].errors, fits[1].errors)
 
 
 def test_a_grid_whose_edge_is_one_point_has_no_boundary(tmp_path):

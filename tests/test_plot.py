@@ -12,7 +12,9 @@ from scipy.ndimage import binary_fill_holes, label
 from test_trimmed_surface import LOOPS
 
 import jaxfit as jf
+from jaxfit.io._output import PICTURES
 from jaxfit.plot import history, loops, surface_and_errors, zebra_stripes
+from jaxfit.plot._picture import blank_figure
 from jaxfit.plot._render import render
 from jaxfit.plot._view import choose_view
 
@@ -62,10 +64,15 @@ def test_a_picture_is_saved_and_returned(tmp_path, suffix):
     assert any(text.startswith("average 0.0") and "maximum 0." in text for text in said)
 
 
+def test_pictures_are_what_matplotlib_writes():
+    assert {suffix[1:] for suffix in PICTURES} <= set(blank_figure(4).canvas.get_supported_filetypes())
+
+
 def test_a_picture_of_an_unknown_format_is_refused(tmp_path):
     for picture, drawn in ((surface_and_errors, fake_fit((50,))), (zebra_stripes, wavy_surface())):
-        with pytest.raises(ValueError, match=r"p.foo has the suffix .foo, .* use one of .*\.pdf, .*\.png"):
-            picture(drawn, path=tmp_path / "p.foo")
+        for name, said in (("p.foo", "the suffix .foo"), ("p", "no suffix")):
+            with pytest.raises(ValueError, match=rf"{name} has {said}, .* use one of \.png, \.pdf, "):
+                picture(drawn, path=tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import diagonal, wavy_surface
+from helpers import diagonal, wavy_grid, wavy_surface
 
 import jaxfit as jf
 from jaxfit._trimmed._inside import inside_on_grid
@@ -184,6 +184,18 @@ def test_a_fit_tells_its_loops_and_the_errors_inside():
     assert fit.message == "all tolerances are met."
     assert "the outer one with 6 vertices, 2 holes (gaps wider than 0.25, the hole length)" in said
     assert f"{int(np.asarray(fit.inside).sum())} of 56 points, average error" in said
+
+
+def test_many_holes_come_with_what_makes_them_fewer():
+    corners = np.array([[0, 0], [0.04, 0], [0.04, 0.04], [0, 0.04]])
+    places = np.stack(np.meshgrid(*2 * [np.linspace(0.1, 0.9, 5)]), axis=2).reshape(-1, 2)
+    fit = jf.interpolate(wavy_grid(8, 7), jf.StandardInterpolation())
+    for count, said in ((20, "the hole length)"), (21, "the hole length; a larger one closes small gaps)")):
+        loops = tuple(place + corners[::-1] for place in places[:count])
+        trimmed = jf.TrimmedSurface(fit.surface, (SQUARE, *loops))
+        stats = {**fit.stats, "hole_length": 0.25}
+        shown = str(dataclasses.replace(fit, trimmed=trimmed, stats=stats))
+        assert f"{count} holes (gaps wider than 0.25, {said}" in shown
 
 
 @pytest.mark.parametrize("which", LOOPS)

@@ -21,7 +21,7 @@ from jaxfit._splines import BSplineSurface
 @shows_progress("fitting a cloud")
 @eager_where_concrete
 def approximate(
-    points: ArrayLike,
+    points: Any,
     base: BSplineSurface,
     method: AbstractIterativeMethod | None = None,
     tol_average: ArrayLike | None = 6e-4,
@@ -39,7 +39,7 @@ def approximate(
     Parameters
     ----------
     points : array (points, d)
-        In any order, any unit.
+        In any order, any unit. Or what `jaxfit.io.read_points` has read.
     base : BSplineSurface
         A first approximation, for instance from `base_surface`. Its knots are kept; new ones are inserted
         only where the method has an `insertion`.
@@ -130,6 +130,7 @@ def approximate(
         "errors": errors,
         "adjoint": adjoint,
     }
+    points = getattr(points, "cloud", points)
     fit = fit_cloud if divided_over(points) is None else fit_sharded_cloud
     return fit(points, base, default_method(method), request)
 

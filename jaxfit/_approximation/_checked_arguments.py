@@ -13,6 +13,7 @@ from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._scaling import Unit, unit_of
 
+METHODS = "OrthogonalDistance(), GeometricApproximation() or StandardApproximation()"
 OUTSIDE = 1e-4  # of the domain: how far out a foot to start from may be
 
 
@@ -61,11 +62,11 @@ def check_options(
             "call interpolate."
         )
     if method is not None:
-        check_kind("method", method, AbstractIterativeMethod, "OrthogonalDistance()")
+        check_kind("method", method, AbstractIterativeMethod, METHODS)
     if errors is not None:
-        check_kind("errors", errors, AbstractErrors, "GlobalFeet()")
+        check_kind("errors", errors, AbstractErrors, "GlobalFeet(), LocalFeet() or AtParameters()")
     if adjoint is not None:
-        check_kind("adjoint", adjoint, AbstractAdjoint, "ImplicitAdjoint()")
+        check_kind("adjoint", adjoint, AbstractAdjoint, "ImplicitAdjoint() or UnrolledAdjoint()")
     check_steps("max_steps", max_steps)
     for name, tolerance in (("tol_average", tol_average), ("tol_maximum", tol_maximum)):
         if tolerance is not None and is_concrete(tolerance):

@@ -18,7 +18,7 @@ from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, zero_momentum
 from jaxfit._checks import Scalar, check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
-from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
@@ -142,7 +142,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
             if getattr(self, name) is not None:
                 check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
-        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_border(self.border)
         check_method(self)
         check_switches(self, ("single_step", "local"))
         check_number("relaxation", self.relaxation, 0.0)

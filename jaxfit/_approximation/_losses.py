@@ -170,7 +170,7 @@ class GemanMcClure(AbstractLoss):
 def check_loss(loss: Any) -> None:
     """Raise unless `loss` is a loss, or None for least squares."""
     if loss is not None:
-        check_kind("loss", loss, AbstractLoss, "Huber()")
+        check_kind("loss", loss, AbstractLoss, "Huber(), Tukey() or GemanMcClure()")
 
 
 def loss_length(loss: AbstractLoss | None, problem: Problem, error: Any) -> Any:

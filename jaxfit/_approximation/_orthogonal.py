@@ -40,9 +40,9 @@ from jaxfit._approximation._smoothing_term import (
     plate_of,
 )
 from jaxfit._barrier import materialise
-from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
+from jaxfit._checks import Scalar, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
@@ -186,7 +186,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             check_smoothing(self.smoothing, "RegularSmoothing()")
         check_loss(self.loss)
         check_insertion(self.insertion)
-        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_border(self.border)
         check_method(self)
         check_number("damping", self.damping, 0.0)
         if is_concrete(self.damping) and not 0 < self.damping <= 1:

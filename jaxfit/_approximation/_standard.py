@@ -17,7 +17,7 @@ from jaxfit._approximation._unrolled_solution import unrolled_solution
 from jaxfit._cells import values_at
 from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._border import AbstractBorder, FixedBorder, held_points
+from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
@@ -114,7 +114,7 @@ class StandardApproximation(AbstractIterativeMethod):
             check_smoothing(self.smoothing, "GeneralizedCrossValidation() or Discrepancy(noise)")
         check_loss(self.loss)
         check_insertion(self.insertion)
-        check_kind("border", self.border, AbstractBorder, "FixedBorder()")
+        check_border(self.border)
         check_method(self)
         check_switches(self, ("parameter_correction",))
 

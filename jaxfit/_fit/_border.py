@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfit._checks import check_switches, is_concrete
+from jaxfit._checks import check_kind, check_switches, is_concrete
 
 
 class AbstractBorder(eqx.Module):
@@ -101,6 +101,12 @@ class FixedSides(AbstractBorder):
         """The chosen sides."""
         along_u = (ends_u[0] & self.u0) | (ends_u[1] & self.u1)
         return along_u[:, None] | ((ends_v[0] & self.v0) | (ends_v[1] & self.v1))[None, :]
+
+
+def check_border(border: Any) -> None:
+    """Raise unless `border` is one."""
+    names = "FixedBorder(), FixedCorners(), FixedSides(u0=True) or FreeBorder()"
+    check_kind("border", border, AbstractBorder, names)
 
 
 def held_points(border: AbstractBorder, shape: tuple[int, ...], used: Any) -> Bool[Any, "nu nv"]:

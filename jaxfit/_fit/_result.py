@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from jaxfit._checks import is_concrete
 from jaxfit._fit._history import History
 from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._summary import describe, describe_briefly, with_folds
+from jaxfit._fit._summary import describe, describe_briefly, said_reason
 from jaxfit._quality import Regularity, regularity
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
@@ -119,12 +119,13 @@ class Fit(eqx.Module):
 
     @property
     def message(self) -> str:
-        """Why the fit stopped, whether its surface folds, and what the errors of a symmetrised grid refer to.
+        """Why the fit stopped; that its surface folds or is the base surface, if so; and what the errors of a
+        symmetrised grid refer to.
 
         Folds are those of `regularity`; a fit that is traced or one of a batch does not tell.
         """
         sentences: Any = RESULTS
-        sentence = with_folds(self, sentences[self.result])
+        sentence = said_reason(self, sentences[self.result])
         moved = 0.5 * self.stats.get("asymmetry", 0.0)
         if is_concrete(moved) and np.ndim(moved) == 0 and moved > self.stats.get("tolerance", np.inf):
             return (

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 FAR, MUCH = 4.0, 0.05  # times the average error; of the sum of errors
+MANY_HOLES = 20
 _REMEDIES = {
     True: "look at the order of the grid's points there (fit.regularity.fold_parameters)",
     False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
@@ -127,7 +128,8 @@ def _trim_facts(fit: Any) -> dict[str, str]:
         return {}
     holes = {0: "no hole", 1: "one hole"}.get(trimmed.holes, f"{trimmed.holes:,} holes")
     if trimmed.holes and "hole_length" in fit.stats:
-        holes += f" (gaps wider than {float(fit.stats['hole_length']):.4g}, the hole length)"
+        advice = "; a larger one closes small gaps" if trimmed.holes > MANY_HOLES else ""
+        holes += f" (gaps wider than {float(fit.stats['hole_length']):.4g}, the hole length{advice})"
     inside, errors = np.asarray(fit.inside), 100 * np.asarray(fit.errors, float)
     within = f"{int(inside.sum()):,} of {inside.size:,} points"
     if inside.any():
@@ -162,6 +164,11 @@ def _largest_group(found: Regularity) -> str:
     return "{} round u = {:.3g}, v = {:.3g}".format(groups, *middle)
 
 
+def _moves(fit: Any) -> int:
+    """Iterations, with those of all nets before the last."""
+    return int(fit.stats["num_steps"]) + int(fit.stats.get("growth_steps", 0))
+
+
 def _share_at_border(fit: Any) -> float:
     """What points far from the surface whose feet are on its border add to the sum of all errors."""
     errors = np.asarray(fit.errors)
@@ -173,9 +180,14 @@ def _share_at_border(fit: Any) -> float:
     return float(errors[beyond].sum() / max(errors.sum(), np.finfo(float).tiny))
 
 
-def with_folds(fit: Any, sentence: str) -> str:
-    """The reason for which a fit stopped, and that its surface folds if it does, or was kept from folding."""
+def said_reason(fit: Any, sentence: str) -> str:
+    """The reason for which a fit stopped, that nothing was fitted if so, and that its surface folds if it
+    does, or was kept from folding.
+    """
     missed = is_single(fit) and not bool(fit.converged)
+    if is_single(fit) and _is_of_cloud(fit) and not missed and not _moves(fit):
+        advice = "" if fit.folds else ", which is returned; lower the tolerances for a closer one"
+        sentence = f"{sentence.removesuffix('.')} by the base surface{advice}."
     of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
         sentence = (

@@ -160,9 +160,13 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
 
     def __check_init__(self) -> None:
         for name, kind, example in (
-            ("parametrisation", AbstractParametrisation, "ChordLength()"),
-            ("repositioning", AbstractRepositioning, "OptimalRepositioning()"),
-            ("acceleration", AbstractAcceleration, "Richardson()"),
+            ("parametrisation", AbstractParametrisation, "ChordLength() or Centripetal()"),
+            (
+                "repositioning",
+                AbstractRepositioning,
+                "OptimalRepositioning(), UnitWeights() or ConstantWeight()",
+            ),
+            ("acceleration", AbstractAcceleration, "Richardson() or Chebyshev()"),
             ("symmetry", (Reflection, type(None)), "Reflection()"),
             ("adjoint", AbstractAdjoint, "UnrolledAdjoint()"),
         ):

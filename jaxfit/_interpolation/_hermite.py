@@ -86,7 +86,9 @@ class NormalInterpolation(AbstractDirectInterpolation):
     normal_tolerance: float | None = None
 
     def __check_init__(self) -> None:
-        check_kind("parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength()")
+        check_kind(
+            "parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength() or Centripetal()"
+        )
         if self.normal_tolerance is not None:
             check_number("normal_tolerance", self.normal_tolerance, 0.0)
 

@@ -14,6 +14,7 @@ from jaxfit._checks import (
     check_order,
     check_steps,
     eager_where_concrete,
+    has_coordinates_first,
     is_concrete,
 )
 from jaxfit._fit._result import Fit, Name, converged_or_raise
@@ -24,11 +25,13 @@ from jaxfit._interpolation._method import CORNERS, AbstractInterpolation, Frame,
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._progress_line import shows_progress
 
+METHODS = "GeometricInterpolation(), StandardInterpolation() or NormalInterpolation()"
+
 
 @shows_progress("interpolating a grid")
 @eager_where_concrete
 def interpolate(
-    grid: ArrayLike,
+    grid: Any,
     method: AbstractInterpolation | None = None,
     order: tuple[int, int] = (4, 4),
     tolerance: ArrayLike | None = None,
@@ -44,7 +47,8 @@ def interpolate(
     Parameters
     ----------
     grid : array (n, m, d)
-        Any unit; at least `order` points in each direction.
+        Any unit; at least `order` points in each direction. Or what `jaxfit.io.read_points` has read, if that
+        is a grid.
     method : GeometricInterpolation or StandardInterpolation, optional
         Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals.
     order : (K, L)
@@ -100,7 +104,7 @@ def interpolate(
     data = _checked_grid(grid, order)
     if method is None:
         method = GeometricInterpolation() if normals is None else NormalInterpolation()
-    check_kind("method", method, AbstractInterpolation, "GeometricInterpolation()")
+    check_kind("method", method, AbstractInterpolation, METHODS)
     normals = method.check_normals(normals, data, order)
     fit = method.fit(_scaled(data, normals, order, tolerance, max_steps), progress)
     fit = dataclasses.replace(fit, stats={"method": Name(type(method).__name__), **fit.stats})
@@ -121,13 +125,22 @@ def _scaled(data: Any, normals: Any, order: tuple[int, int], tolerance: Any, max
     return GridProblem(inner, normals, frame, unit, (int(order[0]), int(order[1])))
 
 
-def _checked_grid(grid: ArrayLike, order: tuple[int, int]) -> Any:
+def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
+    if hasattr(grid, "cloud"):
+        if grid.grid is None:
+            raise ValueError(
+                f"grid must be one, but {grid.name} holds {len(grid.cloud):,} scattered points; fit them by "
+                "fit_points, or say their rows and columns by as_grid(n, m)."
+            )
+        grid = grid.grid
     data = as_floating("grid", grid, 3)
     n, m, d = data.shape
     if n < order[0] or m < order[1] or d < 1:
+        first = has_coordinates_first(data.shape)
+        advice = "pass np.moveaxis(grid, 0, -1)" if first else "give more points or lower the order"
         raise ValueError(
             f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
-            f"shape {data.shape}; give more points or lower the order."
+            f"shape {data.shape}; {advice}."
         )
     # NumPy's arrays cost no calls of their own.
     return np.asarray(data) if is_concrete(data) else data.astype(working_dtype())

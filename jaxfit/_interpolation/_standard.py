@@ -94,7 +94,9 @@ class StandardInterpolation(AbstractDirectInterpolation):
     restart: int = 20
 
     def __check_init__(self) -> None:
-        check_kind("parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength()")
+        check_kind(
+            "parametrisation", self.parametrisation, AbstractParametrisation, "ChordLength() or Centripetal()"
+        )
         check_number("max_corrections", self.max_corrections, 0, whole=True)
         check_number("foot_tolerance", self.foot_tolerance, 0.0)
         check_number("restart", self.restart, 1, whole=True)

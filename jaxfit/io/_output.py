@@ -11,6 +11,7 @@ LIBRARIES = {  # of the extra `cad`
     ".3dm": "rhino3dm",
     **dict.fromkeys((".ply", ".stl", ".obj"), "trimesh"),
 }
+PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".eps", ".ps")
 _SURFACES = (".npz", ".json", *LIBRARIES)
 
 

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxfit._fit._summary import errors_of_all
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit._trimmed._trimmed_surface import host_loops
-from jaxfit.io._output import check_output, write_atomically
+from jaxfit.io._output import PICTURES, check_output, write_atomically
 from jaxfit.plot._part import check_fit, folds_in, of_fit
 from jaxfit.plot._render import render
 from jaxfit.plot._view import View
@@ -38,7 +38,8 @@ def surface_and_errors(
     The surface is shaded and carries some of its knot lines. A flat one (terrain) is stretched
     along its short axis, and the caption says by how much. Errors are coloured in % of the
     diagonal of the data's bounding box, over the parameters (u, v) of the points, or over the
-    rows and columns of a grid; colours end at the 99.5th percentile, so that a few outliers do
+    rows and columns of a grid, which run the way they run on the left: their numbers may grow
+    from right to left. Colours end at the 99.5th percentile, so that a few outliers do
     not hide the rest. Of more than 20,000 scattered points every cell of a raster shows its
     largest error. Folds of the surface (`fit.regularity`) are red on the left and crosses on the
     right; the caption counts them. It has the smallest angle between parameter lines and the
@@ -248,9 +249,8 @@ def blank_figure(width: int, rows: int = 1) -> "Figure":
 
 
 def save(figure: "Figure", path: Path, dpi: int) -> None:
-    """Write a picture, whole or not at all; a name without a suffix gets a PNG."""
-    if path.suffix:
-        check_output(path, tuple(f".{name}" for name in sorted(figure.canvas.get_supported_filetypes())))
+    """Write a picture, whole or not at all."""
+    check_output(path, PICTURES)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lstrip(".").lower() or "png", dpi=dpi)
+    figure.savefig(buffer, format=path.suffix.lstrip(".").lower(), dpi=dpi)
     write_atomically(path, buffer.getvalue())
