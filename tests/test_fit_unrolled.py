@@ -61,7 +61,8 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_except(METHODS, "standard"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 def test_reverse_and_forward_mode_agree_with_central_differences(name):
     def of(inputs):
         return few_steps(inputs["points"], base(), METHODS[name], weights=inputs["weights"])

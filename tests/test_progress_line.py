@@ -61,9 +61,9 @@ def test_the_line_follows_the_work_and_goes(shown):
 
 
 def test_fits_say_what_they_do(shown):
-    text = shown(jf.fit_points, CLOUD, jf.Boundary(**SIDES), net=(6, 5), max_steps=2)
+    text = shown(jf.fit_points, CLOUD, jf.Boundary(**SIDES), net=(6, 6), max_steps=2)
     assert "jaxfit: making a base surface" in text
-    assert "jaxfit: fitting 6 x 5 control points to 300 points" in text
+    assert "jaxfit: fitting 6 x 6 control points to 300 points" in text
     assert "jaxfit: interpolating a grid" in shown(jf.interpolate, GRID)
 
 
@@ -72,15 +72,15 @@ def test_a_net_chosen_by_some_of_the_points_says_of_how_many(monkeypatch):
     monkeypatch.setattr(_cloud_fit, "doing", said.append)
     request = {"tol_average": 1e-3, "tol_maximum": None, "max_steps": 0, "weights": None, "start": None}
     request |= {"progress": None, "throw": False, "errors": None, "adjoint": None}
-    base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 5))
-    for room in (None, _cloud_fit.Room((6, 5), 0, len(CLOUD)), _cloud_fit.Room((6, 5), 0, 400)):
+    base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 6))
+    for room in (None, _cloud_fit.Room((6, 6), 0, len(CLOUD)), _cloud_fit.Room((6, 6), 0, 400)):
         _cloud_fit.fit_cloud(CLOUD, base, jf.OrthogonalDistance(), request, room)
     counts = ["300", "300", "300 of 400"]
-    assert said == [f"fitting 6 x 5 control points to {count} points" for count in counts]
+    assert said == [f"fitting 6 x 6 control points to {count} points" for count in counts]
 
 
 def test_fits_side_by_side_share_one_line(shown):
-    base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 5))
+    base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 6))
     text = shown(jf.map_fits, [CLOUD, CLOUD, CLOUD], base, max_steps=1)
     assert "jaxfit: fitting clouds, 0 of 2" in text
     assert text.count("\x1b[?25l") == 1  # the cursor is hidden once a line

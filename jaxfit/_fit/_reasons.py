@@ -40,8 +40,8 @@ class RESULTS(eqx.Enumeration):
         "good surface if there was one; check the data and the base surface."
     )
     rounded = (
-        "the tolerance was met until the control points were rounded; loosen it, work in float64 by "
-        'jax.config.update("jax_enable_x64", True), or, if the data is far from the origin, subtract its '
+        "the tolerance was met until the control points were rounded; loosen it, work in float64 (the flag "
+        "jax_enable_x64 of jax.config), or, if the data is far from the origin, subtract its "
         "centre."
     )
     normals_missed = (
