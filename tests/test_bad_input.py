@@ -263,6 +263,8 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         (lambda: jf.fit_points(POINTS, BOUNDARY, tol_average=6), "must be at most 1, .* 6e-4 for 0.06 %"),
         (lambda: jf.fit_points((POINTS + 5e6).astype(np.float32), BOUNDARY), "before they are rounded"),
         (lambda: jf.fit_points((POINTS + 5e6).astype(np.float32)), "before they are rounded"),
+        (lambda: jf.approximate(POINTS, wavy_surface(), tol_average=None), r"pass tol_average=0\.0 to go on"),
+        (lambda: jf.fit_points(POINTS, BOUNDARY, tol_average=None), "must not both be None"),
         (lambda: jf.approximate(POINTS, wavy_surface(), tol_maximum=1.5), "such as 6e-4 for 0.06 %"),
     ],
 )

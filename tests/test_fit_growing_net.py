@@ -5,7 +5,9 @@ import pytest
 from helpers import diagonal
 
 import jaxfit as jf
-from jaxfit._base import carried_base
+from jaxfit._approximation._growing_net import likeness_of_neighbours
+from jaxfit._approximation._level_nets import BoundaryNets
+from jaxfit._base import carried_base, net_of_sides
 
 COUNT = 3_000
 
@@ -37,6 +39,55 @@ def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
     coarse = jf.fit_points(CLEAN, BOUNDARY, tol_average=1e-2)
     assert coarse.converged
     assert coarse.surface.shape == (8, 8)
+
+
+def test_the_first_net_shows_the_waves_of_the_sides():
+    """Coarser ones would take them for longer waves, which finer ones do not get rid of."""
+
+    def wavy(u, v):
+        return np.stack(np.broadcast_arrays(u, v, 0.02 * np.sin(24 * np.pi * u) + 0.1 * v * v), axis=-1)
+
+    line, zero = np.linspace(0, 1, 400), np.zeros(400)
+    sides = wavy(line, zero), wavy(line, zero + 1), wavy(zero, line), wavy(zero + 1, line)
+    boundary = jf.Boundary(*sides)
+    nets = BoundaryNets(boundary, (4, 4), 5000)
+    nu, nv = nets.net(8.0, 200)
+    assert 2.5 * 12 <= nu <= 6 * 12
+    assert nv == 8
+    finer = nets.net(18.0, 200)
+    assert finer[0] == int(nu * 1.5)
+    assert finer[1] > nv
+    assert BoundaryNets(boundary, (4, 4), 400).net(8.0, 200)[0] < 12  # too few points
+    noise = 0.02 * np.random.default_rng(0).normal(size=(4, 400, 3))
+    noise[:, [0, -1]] = 0.0
+    rough = jf.Boundary(*(side * [1, 1, 0] + x for side, x in zip(sides, noise, strict=True)))
+    assert max(net_of_sides(rough, (4, 4), 150)) <= 10  # noise takes no finer net
+
+
+def test_errors_of_neighbours_are_alike_where_the_net_is_too_coarse():
+    for noise, least, most in ((0.0, 0.6, 1.0), (0.05, -0.1, 0.1)):
+        points = CLEAN + noise * np.random.default_rng(1).normal(size=CLEAN.shape)
+        fit = jf.fit_points(points, BOUNDARY, net=(8, 8), max_steps=3)
+        assert least < likeness_of_neighbours(fit, points) < most
+        points[5] += 10.0
+        far = jf.approximate(points, fit.surface, max_steps=0)
+        assert least - 0.05 < likeness_of_neighbours(far, points) < most
+
+
+@pytest.mark.slow
+def test_waves_across_a_patch_lead_no_fit_astray():
+    """Each net that grows from the one before would come to rest on wrong waves, 1 % of the diagonal away."""
+
+    def wavy(u, v):
+        return np.stack([u, v, 0.02 * np.sin(18 * np.pi * (u + v) / 1.4)], axis=-1)
+
+    boundary = jf.Boundary.from_grid(wavy(*np.meshgrid(*2 * [np.linspace(0, 1, 200)], indexing="ij")))
+    fit = jf.fit_points(wavy(*np.random.default_rng(0).uniform(size=(2, 4000))), boundary)
+    assert fit.converged
+    assert fit.folds == 0
+    assert float(fit.maximum_error) < 6e-3
+    there = np.asarray(fit.surface(*np.random.default_rng(1).uniform(size=(2, 5000))))
+    assert np.abs(there[:, 2] - wavy(there[:, 0], there[:, 1])[:, 2]).max() < 0.01
 
 
 @pytest.mark.slow
@@ -105,7 +156,8 @@ def test_few_points_and_other_wishes_keep_one_net():
     assert few.surface.shape == (8, 8)
     inserting = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=50))
     assert jf.fit_points(CLEAN, BOUNDARY, method=inserting, max_steps=2).surface.shape == (20, 19)
-    assert jf.fit_points(CLEAN, BOUNDARY, tol_average=None, max_steps=1).surface.shape == (20, 19)
+    start = tuple(np.full(COUNT, 0.5) for _ in "uv")
+    assert jf.fit_points(CLEAN, BOUNDARY, start=start, max_steps=1).surface.shape == (20, 19)
 
 
 @pytest.mark.slow

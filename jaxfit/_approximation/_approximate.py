@@ -49,8 +49,9 @@ def approximate(
         its time. The fit's `stats["method"]` is the name.
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
-        diagonal of the data's bounding box. None sets no limit; with two Nones the base is returned. Default:
-        6e-4 (the paper's 0.06 %) on average, no limit on the maximum.
+        diagonal of the data's bounding box. None sets no limit, but not on both; 0.0 lets a fit go on until
+        its errors stop falling, which takes a comparison of nets or methods. Default: 6e-4 (the paper's
+        0.06 %) on average, no limit on the maximum.
     max_steps : int
         The largest number of iterations (default 200).
     weights : array (points,), optional

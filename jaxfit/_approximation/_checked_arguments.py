@@ -22,7 +22,7 @@ def checked_request(
     domain: Any = None,
     *,
     method: Any = None,
-    tol_average: Any = None,
+    tol_average: Any = 0.0,
     tol_maximum: Any = None,
     max_steps: Any = 0,
     weights: Any = None,
@@ -76,6 +76,11 @@ def check_options(
                     f"{name} must be at most 1, but is {tolerance!r}; give a fraction of the diagonal, such "
                     "as 6e-4 for 0.06 %."
                 )
+    if tol_average is None and tol_maximum is None:
+        raise ValueError(
+            "tol_average and tol_maximum must not both be None, for every surface meets that; pass "
+            "tol_average=0.0 to go on until the errors stop falling."
+        )
     if progress is not None and not callable(progress):
         raise TypeError(
             f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "

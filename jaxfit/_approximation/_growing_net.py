@@ -10,22 +10,27 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._cloud_fit import Room, fit_cloud
 from jaxfit._approximation._errors import LocalFeet
-from jaxfit._approximation._level_nets import AbstractNets
+from jaxfit._approximation._level_nets import FIRST_SIZE, AbstractNets
+from jaxfit._approximation._regular_smoothing import RegularSmoothing
+from jaxfit._base import mean_distance_to
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._splines import BSplineSurface
 
-FIRST_SIZE = 8.0  # control points along each direction of a square patch
 MOST_SIZE = 200  # control points along either direction
 # From one net to the next the size grows by a factor or, far from the tolerance, by its square: sizes are
 # those of one ladder, so that clouds that differ little get the same net.
 GROWTH, MOST_FACTORS = 1.2, 2
 BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
+# Where it does not, but the errors of neighbours are so much alike that they are no noise, so many finer nets
+# are tried all the same: waves that a net is too coarse for take several to be found.
+ALIKE, PATIENCE = 0.5, 4
 LEVEL_STEPS = 20  # iterations with each net but the last
 # Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of those
 # with feet beside its own, is FAR times the average's tolerance away, if the next net brings it so much
 # nearer.
 PATCH, NEARER = 9, 0.8
+LOST = 0.9  # of the mean distance of a surface that is not fitted, from which a fit is no better
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
 # A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
@@ -91,18 +96,24 @@ class NetGrowth:
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
-        best, met, before, size = None, None, None, FIRST_SIZE
+        best, met, before, size, waited = None, None, None, FIRST_SIZE, 0
         while True:
             level = self._level(size, base, before, met is not None)
+            if before is not None:
+                level = self._found_again(level, met is not None)
             if met is not None and not (self._is_met(level) and level.patch < NEARER * met.patch):
                 return met, RESULTS.converged
             if self._is_met(level):
                 met = level
                 if level.patch <= self.far:
                     return met, RESULTS.converged
-            elif best is not None and not level.held_out < BETTER * best.held_out:
+            if best is None or level.held_out < BETTER * best.held_out or met is not None:
+                best, waited = level, 0
+            elif waited == PATIENCE or not self._likeness(level) >= ALIKE:
                 return best, RESULTS.noise_reached
-            best, coarser, size = level, size, size * self._growth(level)
+            else:
+                waited += 1
+            coarser, size = size, size * self._growth(level)
             if size > self.most or self.net(size) == self.net(coarser):
                 return best, RESULTS.net_exhausted if met is None else RESULTS.converged
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
@@ -133,13 +144,43 @@ class NetGrowth:
         fit = self.fit(self.points[some], base, request)
         return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()), farthest_patch(fit))
 
+    def _found_again(self, level: Level, farther: bool) -> Level:
+        """The level, or if the fit has lost its way, one that begins with a surface made of the points alone.
+
+        Where nets are too coarse for the waves of a sheet, feet come to rest on wrong ones, and finer nets
+        keep them there. A fit is nearer than a smoothed surface at parameters that come from neighbours,
+        unless that has happened. What was smooth at first would take the waves away again: where this helps,
+        later fits do without.
+        """
+        if (self._is_met(level) and level.patch <= self.far) or not self._likeness(level) >= ALIKE:
+            return level
+        some, _ = self._chosen(level.size)
+        fresh = self.nets.fresh(self.points[some], self.net(level.size))
+        if fresh is None:
+            return level
+        distance = mean_distance_to(fresh, self.points[some]) / float(level.fit.stats["diagonal"])
+        if float(level.fit.average_error) < LOST * distance:
+            return level
+        method, self.method = self.method, without_first_smoothing(self.method)
+        other = self._level(level.size, fresh, None, farther)
+        if other.held_out < level.held_out:
+            return other
+        self.method = method
+        return level
+
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
         most = ENOUGH
-        while most < POINTS_TO_CHOOSE * size**2:
+        nu, nv = self.net(size)
+        while most < POINTS_TO_CHOOSE * nu * nv:
             most *= 2
         some = self.sorted[:: -(-len(self.sorted) // most)]
         return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
+
+    def _likeness(self, level: Level) -> float:
+        """How much the errors of neighbours are alike, as vectors: 0 for noise, 1 for a net too coarse."""
+        some, _ = self._chosen(level.size)
+        return likeness_of_neighbours(level.fit, self.points[some])
 
     def _growth(self, level: Level) -> float:
         """How many times finer the next net is: errors fall about with the square of the size."""
@@ -155,17 +196,44 @@ class NetGrowth:
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
 
 
+def without_first_smoothing(method: Any) -> Any:
+    """The method with the smoothing that it would end with from the first step on, if it has such a one."""
+    smoothing = getattr(method, "smoothing", None)
+    if not isinstance(smoothing, RegularSmoothing):
+        return method
+    return dataclasses.replace(method, smoothing=dataclasses.replace(smoothing, first=smoothing.least))
+
+
 def farthest_patch(fit: Fit) -> float:
     """The greatest median of the errors of a point and of those with the nearest feet: single outliers, that
     have good points beside their feet, leave it alone.
     """
+    return float(np.median(np.asarray(fit.errors)[_beside(fit, PATCH)], axis=1).max())
+
+
+def likeness_of_neighbours(fit: Fit, points: Float[np.ndarray, "points d"]) -> float:
+    """The correlation of the vectors from the surface to points and to those with the next feet, the longest
+    ones shortened: outliers are not to decide.
+    """
+    from scipy.interpolate import NdBSpline
+
+    surface = fit.surface
+    knots = np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float)
+    spline = NdBSpline(knots, np.asarray(surface.control_points, float), tuple(k - 1 for k in surface.order))
+    away = points - spline(np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1))
+    length = np.linalg.norm(away, axis=1)
+    away *= (np.minimum(length, 3 * np.median(length)) / np.maximum(length, np.finfo(float).tiny))[:, None]
+    return float((away * away[_beside(fit, 2)[:, 1]]).sum() / max((away**2).sum(), np.finfo(float).tiny))
+
+
+def _beside(fit: Fit, count: int) -> Int[np.ndarray, "points count"]:
+    """The points with the nearest feet, each first its own."""
     from scipy.spatial import KDTree
 
     sides = zip((fit.u, fit.v), fit.surface.domain, fit.surface.shape, strict=True)
     feet = np.stack([np.asarray(x) * (n / float(end - begin)) for x, (begin, end), n in sides], axis=1)
     feet = np.nan_to_num(feet)  # of a fit that has diverged, whose errors are not finite either
-    beside = KDTree(feet, balanced_tree=False).query(feet, PATCH, workers=-1)[1]
-    return float(np.median(np.asarray(fit.errors)[beside], axis=1).max())
+    return KDTree(feet, balanced_tree=False).query(feet, count, workers=-1)[1]
 
 
 def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:

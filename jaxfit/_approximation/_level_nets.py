@@ -2,16 +2,33 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base import Boundary, carried_base, free_base, net_of_ratio, net_of_size
+from jaxfit._base import (
+    Boundary,
+    Meshless,
+    MeshlessAt,
+    base_surface,
+    carried_base,
+    cloud_of,
+    free_base,
+    net_of_ratio,
+    net_of_sides,
+    net_of_size,
+)
 from jaxfit._scan import Sheet
 from jaxfit._splines import BSplineSurface
 
+FIRST_SIZE = 8.0  # control points along each direction of a square patch
 MOST_SIZE = 96  # control points along either direction of a sheet, which may be rough at all scales
+
+MOST_FRESH = 64**2  # control points of the largest net that is fitted anew
+MUCH = 1.25
+SIDES_MOST = 150  # control points that the sides are given along either direction to begin with
 
 Feet = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
@@ -33,6 +50,11 @@ class AbstractNets(ABC):
         """`surface` with another net."""
 
     @abstractmethod
+    def fresh(self, points: Float[np.ndarray, "points d"], net: tuple[int, int]) -> BSplineSurface | None:
+        """A surface made of the points alone, whatever coarser nets have made of them; None if there is none,
+        or it takes too long."""
+
+    @abstractmethod
     def feet(self, net: tuple[int, int]) -> Feet | None:
         """Those of the points on every surface that is new to them, if known."""
 
@@ -44,14 +66,38 @@ class BoundaryNets(AbstractNets):
     points_a_control_point = 2.0
     boundary: Boundary
     order: tuple[int, int]
+    points: int
+    _known: MeshlessAt | None = None
 
     def net(self, size: float, most: int) -> tuple[int, int]:
-        """Shared between the directions by the lengths of the sides."""
-        return net_of_size(size, self.boundary, self.order, most)
+        """Shared between the directions by the lengths of the sides; more where the sides have waves, which
+        the first net shows already, and later ones refine with the root of the size."""
+        net = net_of_size(size, self.boundary, self.order, most)
+        finer = np.sqrt(max(size / FIRST_SIZE, 1.0))
+        nu, nv = (int(max(n, min(least * finer, most))) for n, least in zip(net, self._least, strict=True))
+        return nu, nv
+
+    @cached_property
+    def _least(self) -> tuple[int, int]:
+        """What the sides take where the first net has much less; 0 elsewhere."""
+        least = net_of_sides(self.boundary, self.order, SIDES_MOST)
+        if self.points_a_control_point * least[0] * least[1] > self.points:
+            return 0, 0
+        usual = net_of_size(FIRST_SIZE, self.boundary, self.order, SIDES_MOST)
+        nu, nv = (n if n > MUCH * other else 0 for n, other in zip(least, usual, strict=True))
+        return nu, nv
 
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """On the knots of the boundary curves, with these as sides."""
         return carried_base(surface, self.boundary, net, self.order)
+
+    def fresh(self, points: Float[np.ndarray, "points d"], net: tuple[int, int]) -> BSplineSurface | None:
+        """Smoothed, at parameters that come from neighbours and not from a projection."""
+        if points.shape[1] != 3 or net[0] * net[1] > MOST_FRESH:
+            return None
+        if self._known is None:
+            self._known = Meshless().at_parameters(cloud_of(points, self.boundary))
+        return base_surface(self.boundary, points, net=net, order=self.order, method=self._known)
 
     def feet(self, net: tuple[int, int]) -> None:
         """To be searched."""
@@ -81,6 +127,9 @@ class SheetNets(AbstractNets):
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface as well: what a coarse net made of the parameters is forgotten."""
         return self.base(net)
+
+    def fresh(self, points: Float[np.ndarray, "points d"], net: tuple[int, int]) -> None:
+        """All bases are."""
 
     def feet(self, net: tuple[int, int]) -> Feet:
         """The parameters of all finite points; those that are not on the sheet get their neighbours'."""

@@ -10,6 +10,7 @@ from jaxfit._base._coons import Greville as Greville
 from jaxfit._base._coons import Uniform as Uniform
 from jaxfit._base._coons import coons_surface as coons_surface
 from jaxfit._base._default_base import default_base as default_base
+from jaxfit._base._default_base import mean_distance_to as mean_distance_to
 from jaxfit._base._default_net import MOST_CONTROL_POINTS as MOST_CONTROL_POINTS
 from jaxfit._base._default_net import check_net_of_cloud as check_net_of_cloud
 from jaxfit._base._default_net import checked_net as checked_net
@@ -25,4 +26,7 @@ from jaxfit._base._delaunay_stars import supported_planes as supported_planes
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
+from jaxfit._base._meshless import MeshlessAt as MeshlessAt
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters
+from jaxfit._base._net_of_sides import net_of_sides as net_of_sides
+from jaxfit._base._normalised_cloud import cloud_of as cloud_of

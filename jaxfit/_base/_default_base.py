@@ -22,14 +22,14 @@ def default_base(
     coons = base_surface(boundary, points, net=net, order=order)
     if points.shape[1] != 3:
         return coons
-    distance = _mean_distance(coons, points)
+    distance = mean_distance_to(coons, points)
     if distance <= FAR * diagonal(points):
         return coons
     other = base_surface(boundary, points, net=net, order=order, method=Meshless())
-    return other if _mean_distance(other, points) < distance else coons
+    return other if mean_distance_to(other, points) < distance else coons
 
 
-def _mean_distance(surface: BSplineSurface, points: Float[np.ndarray, "points 3"]) -> float:
+def mean_distance_to(surface: BSplineSurface, points: Float[np.ndarray, "points 3"]) -> float:
     """Mean distance of the points, computed about their centre, which keeps digits."""
     middle = points.mean(axis=0, dtype=np.float64)
     net = np.asarray(surface.control_points, np.float64) - middle

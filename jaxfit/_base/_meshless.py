@@ -105,9 +105,32 @@ class Meshless(AbstractBaseMethod):
         self, net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], cloud: Cloud
     ) -> Float[Any, "nu nv d"]:
         """The least-squares net."""
+        known = self.at_parameters(cloud)
+        return known.fill(net, knots, order, cloud)
+
+    def at_parameters(self, cloud: Cloud) -> "MeshlessAt":
+        """The method for this cloud, whose parameters are found now, once for all nets."""
         points = thinned(cloud.points, self.most_points)
         square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
-        places = np.clip(along_sides(square, net, knots, order), 0.0, 1.0)
-        reach = max(float(np.linalg.norm(x, axis=-1).max()) for x in (points, *cloud.sides))
-        fit = ThinPlateFit(net, knots, order, places, points)
+        return MeshlessAt(points, square, self.smoothing, self.robust)
+
+
+class MeshlessAt(AbstractBaseMethod):
+    """`Meshless` with the parameters `square` of these points."""
+
+    points: Float[Any, "points d"]
+    square: Float[Any, "points 2"]
+    smoothing: float
+    robust: int
+
+    def check_dimension(self, dimension: int) -> None:
+        """None is wrong: there are parameters."""
+
+    def fill(
+        self, net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], cloud: Cloud
+    ) -> Float[Any, "nu nv d"]:
+        """The least-squares net."""
+        places = np.clip(along_sides(self.square, net, knots, order), 0.0, 1.0)
+        reach = max(float(np.linalg.norm(x, axis=-1).max()) for x in (self.points, *cloud.sides))
+        fit = ThinPlateFit(net, knots, order, places, self.points)
         return smoothed_net(fit, self.smoothing, self.robust, reach)
