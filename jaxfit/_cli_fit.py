@@ -1,6 +1,7 @@
 """The fit of one file, as the arguments of the command ask for it."""
 
 import argparse
+import dataclasses
 import inspect
 import math
 import time
@@ -10,6 +11,7 @@ import jaxfit
 from jaxfit import io
 from jaxfit._checks import check_magnitude
 from jaxfit._cli_methods import asks_for_cloud, asks_for_grid, fit_options, interpolates
+from jaxfit._scan import is_nodata
 
 TERRAIN = "jacksboro"
 _TERRAIN_NET = (62, 57)
@@ -41,7 +43,10 @@ def read(args: argparse.Namespace) -> io.PointData:
     else:
         data = io.read_points(args.input)
         check_magnitude("points", data.cloud)
-    return data if args.grid is None else data.as_grid(*args.grid)
+    data = data if args.grid is None else data.as_grid(*args.grid)
+    if data.grid is not None and is_nodata(data.cloud).any():  # what is left is a scan
+        return dataclasses.replace(data, points=data.cloud, grid=None, boundary=None)
+    return data
 
 
 def fitted_surface(fit: Any) -> Any:

@@ -35,6 +35,7 @@ from jaxfit._checks import (
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
 from jaxfit._progress_line import doing, shows_progress
+from jaxfit._scan import check_measured
 
 
 @shows_progress("fitting a cloud")
@@ -185,6 +186,7 @@ def fit_points(
             "surface outside and call approximate(points, base) inside."
         )
     checked_request(fixed, method=without_derivatives(method), **known)
+    check_measured("points", np.asarray(fixed), "leave them out, or the boundary, for a raw scan is cleaned")
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 FAR, MUCH = 4.0, 0.05  # times the average error; of the sum of errors
 MANY_HOLES = 20
 _REMEDIES = {
-    True: "look at the order of the grid's points there (fit.regularity.fold_parameters)",
+    True: "look there whether the grid's points are in order, and none repeats its neighbour "
+    "(fit.regularity.fold_parameters)",
     False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
 }  # by whether the fit is an interpolation
 

@@ -24,6 +24,7 @@ from jaxfit._interpolation._hermite import NormalInterpolation
 from jaxfit._interpolation._method import CORNERS, AbstractInterpolation, Frame, GridProblem, Progress
 from jaxfit._precision import interpolation_tolerance, working_dtype
 from jaxfit._progress_line import shows_progress
+from jaxfit._scan import check_measured
 
 METHODS = "GeometricInterpolation(), StandardInterpolation() or NormalInterpolation()"
 
@@ -142,5 +143,8 @@ def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
             f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
             f"shape {data.shape}; {advice}."
         )
-    # NumPy's arrays cost no calls of their own.
-    return np.asarray(data) if is_concrete(data) else data.astype(working_dtype())
+    if not is_concrete(data):
+        return data.astype(working_dtype())
+    whole = np.asarray(data)  # NumPy's arrays cost no calls of their own
+    check_measured("grid", whole.reshape(-1, d), "fit what is left by fit_points, as a cloud")
+    return whole

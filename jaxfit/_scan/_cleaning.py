@@ -11,6 +11,8 @@ FAR = 4.0  # times the usual distance of neighbours: a point with nobody near,
 ALOFT = 0.2  # if it is off their plane by so much of its own distance from them,
 SPARSE = 2.0  # or that is so many times what
 COMMON = 0.95  # of all points have at most: the cloud is nowhere so sparse
+STREWN = 10.0  # times the median distance of neighbours: of points that are off their plane by ALOFT, too
+ROUNDS = 4  # most: each finds most of the points that are strewn about
 OFF_USUAL = 8.0  # times the median height of the neighbours over their own planes,
 OFF_MOST = 4.0  # times what four in five of them stay below,
 OFF_SPACING = 0.4  # times the distance of neighbours: all three for a point off the plane of its neighbours
@@ -32,18 +34,26 @@ def cleaned(points: Float[Any, "points 3"]) -> Cleaned:
 
     An outlier has no neighbours within several times the usual distance, or lies off the plane of its
     neighbours: by much more than they lie off theirs. An edge is no outlier, for there neighbours lie off
-    their planes as well; nor is a point on the plane of denser ones, where a sheet turns sparse.
+    their planes as well; nor is a point on the plane of denser ones, where a sheet turns sparse. Points that
+    are strewn about the sheet are each other's neighbours: they are many times as sparse as the cloud, and
+    make no planes.
     """
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     _, first = np.unique(points[finite], axis=0, return_index=True)
     distinct = finite[np.sort(first)]
     kept = distinct
-    if len(distinct) > NEIGHBOURS:
-        kept = distinct[~_outliers(points[distinct])]
+    for _ in range(ROUNDS):
+        if len(kept) <= NEIGHBOURS:
+            break
+        single, strewn = _outliers(points[kept])
+        kept = kept[~(single | strewn)]
+        if not strewn.any():
+            break
     return Cleaned(kept, len(points) - len(finite), len(finite) - len(distinct), len(distinct) - len(kept))
 
 
-def _outliers(points: np.ndarray) -> Bool[np.ndarray, " points"]:
+def _outliers(points: np.ndarray) -> tuple[Bool[np.ndarray, " points"], Bool[np.ndarray, " points"]]:
+    """Those that differ from their neighbours, and those that are strewn about."""
     from scipy.spatial import cKDTree
 
     middle = points - points.mean(axis=0)
@@ -61,7 +71,8 @@ def _outliers(points: np.ndarray) -> Bool[np.ndarray, " points"]:
     least = ROUNDING * np.linalg.norm(np.ptp(middle, axis=0))
     off = (height > OFF_USUAL * usual) & (height > OFF_MOST * most) & (height > OFF_SPACING * spacing + least)
     far = reach > FAR * spacing + least
-    return off | far & ((height > ALOFT * reach) | (reach > SPARSE * np.quantile(reach, COMMON)))
+    strewn = (reach > STREWN * np.median(reach)) & (height > ALOFT * reach)
+    return off | far & ((height > ALOFT * reach) | (reach > SPARSE * np.quantile(reach, COMMON))), strewn
 
 
 def _heights(points: Float[Any, "points 3"], near: Float[Any, "points near 3"]) -> Float[Any, " points"]:

@@ -12,6 +12,17 @@ HUGE = 1e20
 APART = 2.0  # times the range of all other coordinates: farther than that from these
 
 
+def check_measured(name: str, points: Float[Any, "points d"], advice: str) -> None:
+    """Raise if some of the points stand for no data."""
+    missing = is_nodata(points)
+    if missing.any():
+        first = points[np.argmax(missing)]
+        raise ValueError(
+            f"{name} must hold measured points only, but {int(missing.sum()):,} have a coordinate that "
+            f"stands for no data, the first ({', '.join(f'{x:g}' for x in first)}); {advice}."
+        )
+
+
 def is_nodata(points: Float[Any, "points d"]) -> Bool[np.ndarray, " points"]:
     """Where a coordinate is such a number, far from all others."""
     with np.errstate(invalid="ignore"):

@@ -9,17 +9,18 @@ from jaxtyping import Float
 from jaxfit.io._point_data import InputError
 
 FIRST = 0, 1, 2
+_DELIMITERS = {",": "commas", ";": "semicolons", None: "blanks"}
 
 
 def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
-    """The columns x, y and z of a text file, or the first three: commas for .csv, blanks otherwise.
+    """The columns x, y and z of a text file, or the first three: between semicolons if its first line has
+    some, else commas in .csv, blanks otherwise.
 
     Raises
     ------
     InputError
         With the line number, for anything that is not a finite number.
     """
-    delimiter = "," if path.suffix.lower() == ".csv" else None
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -31,6 +32,9 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
         for number, line in enumerate(text.splitlines(), start=1)
         if (stripped := line.strip()) and not stripped.startswith("#")
     ]
+    delimiter = "," if path.suffix.lower() == ".csv" else None
+    if lines and ";" in lines[0][1].split("#")[0]:
+        delimiter = ";"
     names = lines.pop(0)[1].split(delimiter) if lines and _is_header(lines[0][1]) else []
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
@@ -70,7 +74,7 @@ def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: in
     remedy = "write decimals with points, as 1.5"
     cells = re.split(r"[;\s]+", lines[0].split("#")[0].strip())
     found = len(cells) > 1 and any(re.fullmatch(r"[+-]?\d*,\d+", cell) for cell in cells)
-    if not found and delimiter:
+    if not found and delimiter == ",":
         columns = {len(line.split(delimiter)) for line in lines}
         suspicious = columns != {named} and (columns == {6} or (len(columns) > 1 and min(columns) >= 3))
         found = suspicious and not any(re.search(r"[^-+\d,\s]", line) for line in lines)
@@ -107,7 +111,7 @@ def _explain(
     for number, line in lines:
         cells = line.split("#")[0].split(delimiter)
         if len(cells) <= max(columns):
-            hint, least = "commas" if delimiter else "blanks", max(columns) + 1
+            hint, least = _DELIMITERS[delimiter], max(columns) + 1
             return (
                 f"{path}: line {number} has {len(cells)} column{'s' * (len(cells) != 1)}, but a "
                 f"point has {'three' if least == 3 else least}; separate x, y and z by {hint}."
