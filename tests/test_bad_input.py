@@ -28,6 +28,12 @@ POINTS, EDGES = wavy_cloud(60)
 BOUNDARY = jf.Boundary(**EDGES)
 
 
+def without_data(points):
+    marked = points.copy()
+    marked.reshape(-1, 3)[[7, 20], 2] = -9999.0
+    return marked
+
+
 def sentence(error):
     said = str(error.value)
     assert "\n" not in said
@@ -259,6 +265,8 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         (lambda: jf.fit_points(POINTS, net=(65, 64)), "at most 4,096 control points for 60 points"),
         (lambda: jf.interpolate(np.moveaxis(GRID, 2, 0)), r"pass np.moveaxis\(grid, 0, -1\)"),
         (lambda: jf.fit_points(np.moveaxis(GRID, 2, 0), BOUNDARY), r"pass points.reshape\(3, -1\).T"),
+        (lambda: jf.interpolate(without_data(GRID)), r"2 have a coordinate .* \(.*-9999\); fit what is left"),
+        (lambda: jf.fit_points(without_data(POINTS), BOUNDARY), "must hold measured points only, but 2"),
         (lambda: jf.interpolate(PointData(POINTS, None, None, "a")), "a holds 60 scattered points; fit"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, tol_average=6), "must be at most 1, .* 6e-4 for 0.06 %"),
         (lambda: jf.fit_points((POINTS + 5e6).astype(np.float32), BOUNDARY), "before they are rounded"),

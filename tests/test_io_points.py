@@ -118,6 +118,15 @@ def test_text_is_read_exactly(tmp_path, name, content):
     np.testing.assert_array_equal(read_points(text(tmp_path / name, content)).points, POINTS)
 
 
+@pytest.mark.parametrize("name", ["a.csv", "a.txt"])
+def test_semicolons_separate_columns(tmp_path, name):
+    rows = "\n".join(";".join(map(repr, row.tolist())) for row in POINTS[:, [2, 0, 1]])
+    path = text(tmp_path / name, f"z; x; y\n{rows}\n")
+    np.testing.assert_array_equal(read_points(path).points, POINTS)
+    assert "line 2 has 2 columns" in sentence(text(tmp_path / "b.csv", "1;2;3\n4;5\n6;7;8\n9;1;2\n"))
+    assert "by semicolons" in sentence(text(tmp_path / "b.csv", "1;2;3\n4;5\n6;7;8\n9;1;2\n"))
+
+
 def test_scattered_points_can_be_read_as_a_grid(tmp_path):
     read = read_points(text(tmp_path / "a.xyz", lines(" ")))
     np.testing.assert_array_equal(read.as_grid(4, 2).grid, POINTS.reshape(4, 2, 3))

@@ -75,6 +75,17 @@ def test_what_is_left_out_is_counted():
     assert set(sheet.number[sheet.on_sheet]) == set(range(400))
 
 
+@pytest.mark.parametrize(("count", "size"), [(50, 10.0), (250, 10.0), (250, 3.0)])
+def test_points_strewn_about_a_sheet_are_outliers(count, size):
+    """They are each other's neighbours, so that none is far from all others."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-1, 1, size=(2, 5000))
+    sheet = np.stack([x, y, 0.3 * np.sin(2 * x) * np.cos(3 * y)], axis=1)
+    found = cleaned(np.concatenate([sheet, rng.uniform(-size, size, size=(count, 3))]))
+    assert (found.kept < 5000).sum() >= 4998
+    assert (found.kept >= 5000).sum() <= 0.1 * count
+
+
 def test_no_point_is_an_outlier_where_a_sheet_turns_sparse():
     """Half a cylinder of 20,000 points, a tenth of it a hundred times as dense."""
     x, y = np.random.default_rng(4).random((2, 20_000))

@@ -32,8 +32,8 @@ def read_points(path: str | os.PathLike) -> PointData:
                         ``boundary_u1`` (see `jaxfit.Boundary`); other keys are
                         ignored, and so are ``points`` beside a ``grid``
     ``.npy``            one array, (N, 3) scattered or (n, m, 3) grid
-    ``.csv``            scattered, one point a line, commas; a first line of names
-                        is skipped
+    ``.csv``            scattered, one point a line, commas or semicolons; a first
+                        line may hold names
     ``.xyz``, ``.txt``  the same with blanks instead of commas
     ``.ply``, ``.stl``  the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
     ``.obj``, ``.off``  ``.off`` without faces (trimesh)
