@@ -14,7 +14,7 @@ APART = 2.0  # times the range of all other coordinates: farther than that from 
 
 def check_measured(name: str, points: Float[Any, "points d"], advice: str) -> None:
     """Raise if some of the points stand for no data."""
-    missing = is_nodata(points)
+    missing = is_nodata(points.astype(np.float64))  # half precision has none of these numbers
     if missing.any():
         first = points[np.argmax(missing)]
         raise ValueError(
