@@ -5,7 +5,7 @@ import pytest
 from helpers import diagonal
 
 import jaxfit as jf
-from jaxfit._approximation._growing_net import likeness_of_neighbours
+from jaxfit._approximation._errors_of_neighbours import likeness_of_neighbours
 from jaxfit._approximation._level_nets import BoundaryNets
 from jaxfit._base import carried_base, net_of_sides
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._cloud_fit import Room, fit_cloud
 from jaxfit._approximation._errors import LocalFeet
+from jaxfit._approximation._errors_of_neighbours import farthest_patch, likeness_of_neighbours
 from jaxfit._approximation._level_nets import FIRST_SIZE, AbstractNets
 from jaxfit._approximation._regular_smoothing import RegularSmoothing
 from jaxfit._base import mean_distance_to
@@ -29,7 +30,7 @@ LEVEL_STEPS = 20  # iterations with each net but the last
 # Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of those
 # with feet beside its own, is FAR times the average's tolerance away, if the next net brings it so much
 # nearer.
-PATCH, NEARER = 9, 0.8
+NEARER = 0.8
 LOST = 0.9  # of the mean distance of a surface that is not fitted, from which a fit is no better
 LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
@@ -202,38 +203,6 @@ def without_first_smoothing(method: Any) -> Any:
     if not isinstance(smoothing, RegularSmoothing):
         return method
     return dataclasses.replace(method, smoothing=dataclasses.replace(smoothing, first=smoothing.least))
-
-
-def farthest_patch(fit: Fit) -> float:
-    """The greatest median of the errors of a point and of those with the nearest feet: single outliers, that
-    have good points beside their feet, leave it alone.
-    """
-    return float(np.median(np.asarray(fit.errors)[_beside(fit, PATCH)], axis=1).max())
-
-
-def likeness_of_neighbours(fit: Fit, points: Float[np.ndarray, "points d"]) -> float:
-    """The correlation of the vectors from the surface to points and to those with the next feet, the longest
-    ones shortened: outliers are not to decide.
-    """
-    from scipy.interpolate import NdBSpline
-
-    surface = fit.surface
-    knots = np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float)
-    spline = NdBSpline(knots, np.asarray(surface.control_points, float), tuple(k - 1 for k in surface.order))
-    away = points - spline(np.stack([np.asarray(fit.u, float), np.asarray(fit.v, float)], axis=1))
-    length = np.linalg.norm(away, axis=1)
-    away *= (np.minimum(length, 3 * np.median(length)) / np.maximum(length, np.finfo(float).tiny))[:, None]
-    return float((away * away[_beside(fit, 2)[:, 1]]).sum() / max((away**2).sum(), np.finfo(float).tiny))
-
-
-def _beside(fit: Fit, count: int) -> Int[np.ndarray, "points count"]:
-    """The points with the nearest feet, each first its own."""
-    from scipy.spatial import KDTree
-
-    sides = zip((fit.u, fit.v), fit.surface.domain, fit.surface.shape, strict=True)
-    feet = np.stack([np.asarray(x) * (n / float(end - begin)) for x, (begin, end), n in sides], axis=1)
-    feet = np.nan_to_num(feet)  # of a fit that has diverged, whose errors are not finite either
-    return KDTree(feet, balanced_tree=False).query(feet, count, workers=-1)[1]
 
 
 def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
