@@ -44,7 +44,8 @@ def read(args: argparse.Namespace) -> io.PointData:
         data = io.read_points(args.input)
         check_magnitude("points", data.cloud)
     data = data if args.grid is None else data.as_grid(*args.grid)
-    if data.grid is not None and is_nodata(data.cloud).any():  # what is left is a scan
+    as_cloud = data.grid is not None and not interpolates(args.method) and not asks_for_grid(args)
+    if as_cloud and is_nodata(data.cloud).any():  # what is left is a scan
         return dataclasses.replace(data, points=data.cloud, grid=None, boundary=None)
     return data
 

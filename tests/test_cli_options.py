@@ -102,6 +102,18 @@ def test_large_grids_are_approximated(fits, folder):
     np.testing.assert_allclose(boundary.v1, wavy_grid(201, 200)[:, -1], atol=1e-12)
 
 
+@pytest.mark.parametrize(("argv", "name"), [((), "fit_points"), (("--method", "interpolate"), "interpolate")])
+def test_what_is_left_of_a_grid_with_gaps_is_a_scan(fits, folder, argv, name):
+    grid = wavy_grid(20, 20)
+    grid[3:6, 4:8, 2] = -9999.0
+    np.save("gaps.npy", grid)
+    assert run("gaps.npy", *argv) == 0
+    made = fits.made[0]
+    assert made[0] == name  # which refuses the grid in a sentence, if it is to be interpolated
+    assert made[1].shape == ((400, 3) if name == "fit_points" else (20, 20, 3))
+    assert made[2] == ((None,) if name == "fit_points" else ())
+
+
 def test_the_terrain_has_its_own_net(fits, folder):
     assert run("jacksboro") == 0
     name, points, _, options = fits.made[0]

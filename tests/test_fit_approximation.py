@@ -230,6 +230,10 @@ def test_a_base_that_meets_the_tolerances_is_returned_and_said_to_be_it(base):
     assert fit.message.startswith("all tolerances are met by the base surface, which is returned; lower")
     closer = jf.approximate(POINTS, base, tol_average=6e-4)
     assert closer.message == "all tolerances are met."
+    noisy = POINTS + 0.01 * np.random.default_rng(0).normal(size=POINTS.shape)
+    rested = jf.approximate(noisy, base, tol_average=0.0)
+    assert rested.result == jf.RESULTS.stalled
+    assert rested.message == "the errors have stopped falling."  # there is no tolerance to loosen
 
 
 def test_held_and_untouched_control_points_keep_every_bit(base):

@@ -5,7 +5,7 @@ import pytest
 from helpers import diagonal
 
 import jaxfit as jf
-from jaxfit._approximation._errors_of_neighbours import likeness_of_neighbours
+from jaxfit._approximation._errors_of_neighbours import errors_of_neighbours
 from jaxfit._approximation._level_nets import BoundaryNets
 from jaxfit._base import carried_base, net_of_sides
 
@@ -58,6 +58,8 @@ def test_the_first_net_shows_the_waves_of_the_sides():
     assert finer[0] == int(nu * 1.5)
     assert finer[1] > nv
     assert BoundaryNets(boundary, (4, 4), 400).net(8.0, 200)[0] < 12  # too few points
+    stuttering = jf.Boundary(*(np.repeat(side, 5, axis=0) for side in sides))
+    assert net_of_sides(stuttering, (4, 4), 150) == net_of_sides(boundary, (4, 4), 150)
     noise = 0.02 * np.random.default_rng(0).normal(size=(4, 400, 3))
     noise[:, [0, -1]] = 0.0
     rough = jf.Boundary(*(side * [1, 1, 0] + x for side, x in zip(sides, noise, strict=True)))
@@ -68,10 +70,12 @@ def test_errors_of_neighbours_are_alike_where_the_net_is_too_coarse():
     for noise, least, most in ((0.0, 0.6, 1.0), (0.05, -0.1, 0.1)):
         points = CLEAN + noise * np.random.default_rng(1).normal(size=CLEAN.shape)
         fit = jf.fit_points(points, BOUNDARY, net=(8, 8), max_steps=3)
-        assert least < likeness_of_neighbours(fit, points) < most
+        found = errors_of_neighbours(fit, points)
+        assert least < found.correlation < most
+        assert float(fit.average_error) < found.farthest <= float(fit.maximum_error)
         points[5] += 10.0
         far = jf.approximate(points, fit.surface, max_steps=0)
-        assert least - 0.05 < likeness_of_neighbours(far, points) < most
+        assert least - 0.05 < errors_of_neighbours(far, points).correlation < most
 
 
 @pytest.mark.slow

@@ -49,9 +49,9 @@ def approximate(
         its time. The fit's `stats["method"]` is the name.
     tol_average, tol_maximum : float or None
         The fit has converged when the average and the maximum error are at most these fractions of the
-        diagonal of the data's bounding box. None sets no limit, but not on both; 0.0 lets a fit go on until
-        its errors stop falling, which takes a comparison of nets or methods. Default: 6e-4 (the paper's
-        0.06 %) on average, no limit on the maximum.
+        diagonal of the data's bounding box. None sets no limit; not both may be None. With 0.0 a fit goes
+        on until its errors stop falling: compare nets or methods so. Default: 6e-4 (the paper's 0.06 %) on
+        average, no limit on the maximum.
     max_steps : int
         The largest number of iterations (default 200).
     weights : array (points,), optional
@@ -83,7 +83,7 @@ def approximate(
     ------
     ValueError
         If points, weights or start have the wrong shape or are not finite, start lies outside the domain,
-        there are fewer than four points, or all of them coincide.
+        there are fewer than four points, all of them coincide, or no tolerance is given.
 
     Notes
     -----

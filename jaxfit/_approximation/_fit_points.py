@@ -68,7 +68,7 @@ def fit_points(
         Control points along u and v, at most 16 for each point or 4,096 in all, if that is more. Shared
         between the directions by the lengths of the sides if not given.
         Default: the net grows, see Notes. Where it cannot, for fewer than 500 points, a method with an
-        `insertion` of its own, a `start` or no tolerance: about one control point for every eight points,
+        `insertion` of its own or a `start`: about one control point for every eight points,
         at least twice the order and at most 64 each way.
     order : (K, L)
         Degree + 1 along u and v (default (4, 4)).
@@ -115,20 +115,18 @@ def fit_points(
 
     Notes
     -----
-    Without a `net` a coarse one, fine enough for the sides to come within 0.5 % of the diagonal, is fitted to
-    nine in ten of the points and then made up to 1.44 times finer each way, again and again, each fit
-    starting from the one before; or from a surface of the points alone (as `Meshless` makes it), where the
-    fit is hardly nearer than that, for then it took the waves of a sheet for others. Growth ends where the
-    tolerances
+    Without a `net` a coarse one is fitted to nine in ten of the points, fine enough for the sides to come
+    within 0.5 % of the diagonal. It is made up to 1.44 times finer each way, again and again, each fit
+    starting from the one before. A fit that is hardly nearer to the points than the surface that `Meshless`
+    makes of them has come to rest on wrong waves, and starts anew from that. Growth ends where the tolerances
     are met; without a `tol_maximum` finer nets are tried, too, while a whole patch (by the median of nine
     points whose feet are neighbours) is ten times `tol_average` away, as long as they bring it a fifth
     nearer (`tol_maximum=1.0` asks for the average alone). Growth also ends where the tenth of the points
     that was held out comes no nearer to the surface, by 2 % of its average error, as the net gets finer:
-    what is left is noise, and the net before is taken. Not at once where the errors of neighbours are alike
-    (a correlation of 0.5 or more), which noise does not make them: then four finer nets are tried before.
-    And it ends with two points for a control point,
-    without a boundary three; or with 200 control points each way, without a boundary 96. The last fit is
-    one to all points. Each net takes at most 20 iterations, the last up to `max_steps` where the
+    what is left is noise, and the net before is taken. Where errors of neighbours correlate by 0.5 or more,
+    which those of noise do not, four finer nets are tried first. And it ends with two points for a control
+    point, without a boundary three; or with 200 control points each way, without a boundary 96. The last fit
+    is one to all points. Each net takes at most 20 iterations, the last up to `max_steps` where the
     tolerances can be met. Of more than 20,000 points as many as the net needs, 48 for a control point,
     choose it.
 
@@ -248,7 +246,6 @@ def _without_boundary(
 
 def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
     """Whether points can be held out of the fit, and nothing asks for one net."""
-    goals = [options.get(name, _DEFAULTS[name]) for name in ("tol_average", "tol_maximum")]
     if not is_concrete(cloud, options):
         return False
     weights = options.get("weights")
@@ -257,7 +254,6 @@ def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:
         counted >= LEAST_POINTS_TO_GROW
         and getattr(method, "insertion", None) is None
         and options.get("start") is None
-        and any(goal is not None for goal in goals)
         and options.get("max_steps") != 0
     )
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._cloud_fit import Room, fit_cloud
 from jaxfit._approximation._errors import LocalFeet
-from jaxfit._approximation._errors_of_neighbours import farthest_patch, likeness_of_neighbours
+from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, errors_of_neighbours
 from jaxfit._approximation._level_nets import FIRST_SIZE, AbstractNets
 from jaxfit._approximation._regular_smoothing import RegularSmoothing
 from jaxfit._base import mean_distance_to
@@ -47,12 +47,12 @@ EXTENSIONS = 3  # most nets tried with all points where the chosen one misses th
 
 
 class Level(NamedTuple):
-    """A net, its fit to a part of the points, and the errors of those held out and of the farthest patch."""
+    """A net, its fit to a part of the points, the errors of those held out and those of neighbours."""
 
     size: float
     fit: Fit
     held_out: float
-    patch: float
+    beside: ErrorsOfNeighbours
 
 
 class NetGrowth:
@@ -102,15 +102,16 @@ class NetGrowth:
             level = self._level(size, base, before, met is not None)
             if before is not None:
                 level = self._found_again(level, met is not None)
-            if met is not None and not (self._is_met(level) and level.patch < NEARER * met.patch):
+            nearer = met is None or level.beside.farthest < NEARER * met.beside.farthest
+            if met is not None and not (self._is_met(level) and nearer):
                 return met, RESULTS.converged
             if self._is_met(level):
                 met = level
-                if level.patch <= self.far:
+                if level.beside.farthest <= self.far:
                     return met, RESULTS.converged
             if best is None or level.held_out < BETTER * best.held_out or met is not None:
                 best, waited = level, 0
-            elif waited == PATIENCE or not self._likeness(level) >= ALIKE:
+            elif waited == PATIENCE or not level.beside.correlation >= ALIKE:
                 return best, RESULTS.noise_reached
             else:
                 waited += 1
@@ -143,7 +144,8 @@ class NetGrowth:
         if farther:
             request["tol_maximum"] = self.far
         fit = self.fit(self.points[some], base, request)
-        return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()), farthest_patch(fit))
+        beside = errors_of_neighbours(fit, self.points[some])
+        return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()), beside)
 
     def _found_again(self, level: Level, farther: bool) -> Level:
         """The level, or if the fit has lost its way, one that begins with a surface made of the points alone.
@@ -153,7 +155,8 @@ class NetGrowth:
         unless that has happened. What was smooth at first would take the waves away again: where this helps,
         later fits do without.
         """
-        if (self._is_met(level) and level.patch <= self.far) or not self._likeness(level) >= ALIKE:
+        beside = level.beside
+        if (self._is_met(level) and beside.farthest <= self.far) or not beside.correlation >= ALIKE:
             return level
         some, _ = self._chosen(level.size)
         fresh = self.nets.fresh(self.points[some], self.net(level.size))
@@ -178,16 +181,11 @@ class NetGrowth:
         some = self.sorted[:: -(-len(self.sorted) // most)]
         return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
 
-    def _likeness(self, level: Level) -> float:
-        """How much the errors of neighbours are alike, as vectors: 0 for noise, 1 for a net too coarse."""
-        some, _ = self._chosen(level.size)
-        return likeness_of_neighbours(level.fit, self.points[some])
-
     def _growth(self, level: Level) -> float:
         """How many times finer the next net is: errors fall about with the square of the size."""
         far = self.far if self._is_met(level) else None
         goals = self.request["tol_average"], self.request["tol_maximum"], far
-        errors = float(level.fit.average_error), float(level.fit.maximum_error), level.patch
+        errors = float(level.fit.average_error), float(level.fit.maximum_error), level.beside.farthest
         excess = max(
             error / goal if goal else np.inf
             for error, goal in zip(errors, goals, strict=True)

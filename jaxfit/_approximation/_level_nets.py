@@ -16,6 +16,7 @@ from jaxfit._base import (
     carried_base,
     cloud_of,
     free_base,
+    meshless_at,
     net_of_ratio,
     net_of_sides,
     net_of_size,
@@ -96,7 +97,7 @@ class BoundaryNets(AbstractNets):
         if points.shape[1] != 3 or net[0] * net[1] > MOST_FRESH:
             return None
         if self._known is None:
-            self._known = Meshless().at_parameters(cloud_of(points, self.boundary))
+            self._known = meshless_at(Meshless(), cloud_of(points, self.boundary))
         return base_surface(self.boundary, points, net=net, order=self.order, method=self._known)
 
     def feet(self, net: tuple[int, int]) -> None:

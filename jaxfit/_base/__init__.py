@@ -27,6 +27,7 @@ from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless import MeshlessAt as MeshlessAt
+from jaxfit._base._meshless import meshless_at as meshless_at
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters
 from jaxfit._base._net_of_sides import net_of_sides as net_of_sides
 from jaxfit._base._normalised_cloud import cloud_of as cloud_of

@@ -105,18 +105,11 @@ class Meshless(AbstractBaseMethod):
         self, net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], cloud: Cloud
     ) -> Float[Any, "nu nv d"]:
         """The least-squares net."""
-        known = self.at_parameters(cloud)
-        return known.fill(net, knots, order, cloud)
-
-    def at_parameters(self, cloud: Cloud) -> "MeshlessAt":
-        """The method for this cloud, whose parameters are found now, once for all nets."""
-        points = thinned(cloud.points, self.most_points)
-        square = parameters_of(points, cloud.sides, self.neighbours, self.reweightings)
-        return MeshlessAt(points, square, self.smoothing, self.robust)
+        return meshless_at(self, cloud).fill(net, knots, order, cloud)
 
 
 class MeshlessAt(AbstractBaseMethod):
-    """`Meshless` with the parameters `square` of these points."""
+    """`Meshless` for one cloud: these of its points have the parameters `square`, for nets of any size."""
 
     points: Float[Any, "points d"]
     square: Float[Any, "points 2"]
@@ -134,3 +127,10 @@ class MeshlessAt(AbstractBaseMethod):
         reach = max(float(np.linalg.norm(x, axis=-1).max()) for x in (self.points, *cloud.sides))
         fit = ThinPlateFit(net, knots, order, places, self.points)
         return smoothed_net(fit, self.smoothing, self.robust, reach)
+
+
+def meshless_at(method: Meshless, cloud: Cloud) -> MeshlessAt:
+    """The method with the parameters of this cloud, which take most of its time, found once for all nets."""
+    points = thinned(cloud.points, method.most_points)
+    square = parameters_of(points, cloud.sides, method.neighbours, method.reweightings)
+    return MeshlessAt(points, square, method.smoothing, method.robust)

@@ -32,7 +32,8 @@ def net_of_sides(boundary: Boundary, order: tuple[int, int], most: int) -> tuple
 
 def _control_points(line: Float[np.ndarray, "n d"], order: int, most: int, goal: float) -> int:
     """The fewest for one side."""
-    samples = densify(line, LEAST_SAMPLES)
+    forward = np.concatenate([[True], np.any(np.diff(line, axis=0) != 0, axis=1)])
+    samples = densify(line[forward], LEAST_SAMPLES)
     counts = [2 * order]
     while (count := int(np.ceil(STEP * counts[-1]))) <= min(most, len(samples) // SAMPLES):
         counts.append(count)

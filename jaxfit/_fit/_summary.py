@@ -190,9 +190,9 @@ def said_reason(fit: Any, sentence: str) -> str:
     if is_single(fit) and _is_of_cloud(fit) and not missed and not _moves(fit):
         advice = "" if fit.folds else ", which is returned; lower the tolerances for a closer one"
         sentence = f"{sentence.removesuffix('.')} by the base surface{advice}."
-    of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and _is_of_cloud(fit) and fit.result == RESULTS.stalled and not fit.stats["tol_average"]:
         sentence = "the errors have stopped falling."
+    of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
         sentence = (
             f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "

@@ -14,7 +14,7 @@ APART = 2.0  # times the range of all other coordinates: farther than that from 
 
 def check_measured(name: str, points: Float[Any, "points d"], advice: str) -> None:
     """Raise if some of the points stand for no data."""
-    missing = is_nodata(points.astype(np.float64))  # half precision has none of these numbers
+    missing = is_nodata(np.asarray(points, np.float64))  # half precision overflows
     if missing.any():
         first = points[np.argmax(missing)]
         raise ValueError(
@@ -25,9 +25,11 @@ def check_measured(name: str, points: Float[Any, "points d"], advice: str) -> No
 
 def is_nodata(points: Float[Any, "points d"]) -> Bool[np.ndarray, " points"]:
     """Where a coordinate is such a number, far from all others."""
-    with np.errstate(invalid="ignore"):
-        marked = (np.isin(points, USUAL) | (np.abs(points) >= HUGE)) & np.isfinite(points)
     found = np.zeros(len(points), bool)
+    ends = np.stack([np.fmin.reduce(points), np.fmax.reduce(points)]) if len(points) else points
+    if np.isfinite(ends).all() and not _is_marked(ends).any():
+        return found  # as most: what is far from all others is an end
+    marked = _is_marked(points)
     for x, some in zip(points.T, marked.T, strict=True):
         others = x[np.isfinite(x) & ~some]
         if not some.any() or not len(others):
@@ -35,3 +37,9 @@ def is_nodata(points: Float[Any, "points d"]) -> Bool[np.ndarray, " points"]:
         low, high = float(others.min()), float(others.max())
         found |= some & (np.maximum(x - high, low - x) > APART * (high - low))
     return found
+
+
+def _is_marked(x: np.ndarray) -> Bool[np.ndarray, "..."]:
+    """Where a number is one of those."""
+    with np.errstate(invalid="ignore"):
+        return (np.isin(x, USUAL) | (np.abs(x) >= HUGE)) & np.isfinite(x)
