@@ -131,5 +131,5 @@ def _describe(data: io.PointData) -> str:
     notes = [] if data.grid is None else ["grid {} x {}".format(*data.grid.shape)]
     if data.left_out:
         reasons = (f"{count:,} {reason}" for reason, count in data.left_out.items())
-        notes.append(f"left out: {', '.join(reasons)}")
+        notes.append(f"without {', '.join(reasons)}")
     return f"{count} ({'; '.join(notes)})" if notes else count

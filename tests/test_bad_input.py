@@ -303,6 +303,19 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
             lambda: inspect.unwrap(as_floating)("points", PointData(POINTS, None, None, "a"), 2),
             "points must be an array, but is a PointData; pass its .cloud or .grid",
         ),
+        *(
+            (
+                lambda call=call, args=args: inspect.unwrap(call)(*args),
+                "points must be an array, but is a Boundary; pass",
+            )
+            for call, args in (
+                (jf.fit_points, (BOUNDARY, POINTS)),
+                (jf.fit_points, (BOUNDARY,)),
+                (jf.base_surface, (POINTS, BOUNDARY)),
+                (jf.meshless_parameters, (BOUNDARY, POINTS)),
+            )
+        ),
+        (lambda: inspect.unwrap(jf.base_surface)(POINTS), r"or Boundary.from_grid\(grid\), but is a ndarray"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, degree=3), "degree is not an option .* pass order"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, nett=3), "pass any of boundary, net, order, method, base"),
         (

@@ -198,7 +198,7 @@ def test_the_command_reads_a_scan_and_writes_a_step_file(tmp_path, monkeypatch, 
     monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
     assert _cli.main("fit grid.ply -o part.step --grid 8x7 --no-picture".split()) == 0
     said, complaints = capfd.readouterr()
-    assert "56 (grid 8 x 7; left out: 2 not finite)" in said
+    assert "56 (grid 8 x 7; without 2 not finite)" in said
     assert re.search(r"offset +500000\.0 5200000\.0 0\.0", said)
     assert complaints == ""
     corner = points_of(only_face(shape_in(tmp_path / "part.step")), *[np.array([0.0])] * 2)[0, 0]

@@ -99,7 +99,8 @@ class Discrepancy(AbstractSmoothing):
     ----------
     noise : float
         Standard deviation of the distance between a point of weight 1 and the true surface, as a fraction of
-        the diagonal of the data's bounding box.
+        the diagonal of the data's bounding box: of noise that is alike in all directions, that of one
+        coordinate.
     candidates, rounds : int
         As for GeneralizedCrossValidation.
 

@@ -19,6 +19,7 @@ from jaxfit._base import (
     Boundary,
     Coons,
     base_surface,
+    check_boundary,
     check_net_of_cloud,
     checked_net,
     default_base,
@@ -166,9 +167,9 @@ def fit_points(
     check_order(order)
     if hasattr(points, "cloud"):
         points, boundary, faces = _parts(points, boundary, faces)
-    if boundary is None:
+    if boundary is None and not isinstance(points, Boundary):
         return _without_boundary(points, faces, hole_length, net, order, method, base, options)
-    check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
+    check_boundary(boundary, points)
     check_kind("base", base, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     for name, value in (("faces", faces), ("hole_length", hole_length)):
         if value is not None:

@@ -4,7 +4,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base._base_method import AbstractBaseMethod, Coons
-from jaxfit._base._boundary import Boundary, centre_and_size, farthest
+from jaxfit._base._boundary import Boundary, centre_and_size, check_boundary, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._default_net import checked_net, default_net
@@ -94,6 +94,7 @@ def base_surface(
     >>> surface.shape, surface.order, surface(1.0, 1.0).tolist()
     ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
+    check_boundary(boundary, points)
     net = _checked_net(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
@@ -171,11 +172,6 @@ def _checked_net(
     order: tuple[int, int],
     tolerance: float,
 ) -> tuple[int, int] | None:
-    if not isinstance(boundary, Boundary):
-        raise TypeError(
-            f"boundary must be a Boundary, but is a {type(boundary).__name__}; build one with "
-            "Boundary(v0, v1, u0, u1) or Boundary.from_grid(grid)."
-        )
     if not is_concrete(boundary):
         raise TypeError(
             "boundary must be concrete, but is traced; call base_surface outside jit, or blend its curves by "

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxfit._checks import as_floating, as_points, check_number, is_concrete
+from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_concrete
 
 # The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
 _CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
@@ -96,6 +96,13 @@ class Boundary(eqx.Module):
                 f"grid must hold at least 2 x 2 points, but has shape {data.shape}; give an array (n, m, d)."
             )
         return cls(v0=data[:, 0], v1=data[:, -1], u0=data[0], u1=data[-1])
+
+
+def check_boundary(boundary: Any, points: Any) -> None:
+    """Raise unless `boundary` is one, and say so where the points took its place."""
+    if isinstance(points, Boundary):
+        raise TypeError("points must be an array, but is a Boundary; pass it as boundary=.")
+    check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1) or Boundary.from_grid(grid)")
 
 
 def diagonal(*sets: np.ndarray) -> float:

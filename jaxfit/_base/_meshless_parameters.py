@@ -6,12 +6,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfit._base._boundary import Boundary
+from jaxfit._base._boundary import Boundary, check_boundary
 from jaxfit._base._delaunay_stars import Stars, mean_value_weights, stars
 from jaxfit._base._douglas_peucker import chord_lengths, densify
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._parametric_stretch import area_stretch, link_weights
-from jaxfit._checks import as_points, check_kind, check_number, eager_where_concrete, is_concrete
+from jaxfit._checks import as_points, check_number, eager_where_concrete, is_concrete
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
 NODE_SPACING = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
@@ -95,7 +95,7 @@ def meshless_parameters(
     >>> bool(np.allclose(u, x[1:-1, 1:-1].ravel(), atol=1e-6))
     True
     """
-    check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1)")
+    check_boundary(boundary, points)
     check_number("neighbours", neighbours, 6, whole=True)
     check_number("reweightings", reweightings, 0, whole=True)
     if not is_concrete(points, boundary):
