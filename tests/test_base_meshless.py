@@ -289,7 +289,7 @@ def test_fits_take_it_where_the_blend_of_the_sides_is_far_away():
     flat = np.zeros_like(t)
     sides = ((t, flat), (t, flat + 1.0), (flat, t), (flat + 1.0, t))
     boundary = jf.Boundary(*(np.stack([*xy, flat], axis=1) for xy in sides))
-    options = dict(net=(10, 10), tol_average=0.0, max_steps=0)
+    options = dict(net=(10, 10), method=jf.GeometricApproximation(), tol_average=0.0, max_steps=0)
     blended = jf.fit_points(dome, boundary, base=jf.Coons(), **options)
     chosen = jf.fit_points(dome, boundary, **options)
     assert float(chosen.average_error) < 0.05 * float(blended.average_error)

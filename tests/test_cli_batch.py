@@ -20,17 +20,17 @@ from jaxfit.io import read_surface
 
 GOOD = ["a.npz", "b.npz", "grid.npz"]
 BAD = ["garbage.npz", "none.npz", "nan.npz"]
-OPTIONS = "--net 6x6 --max-steps 3 --quiet".split()
+OPTIONS = "--net 8x8 --max-steps 3 --quiet".split()
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     for i, name in enumerate("ab"):
-        points, edges = wavy_cloud(100, seed=i)
+        points, edges = wavy_cloud(400, seed=i)
         sides = {f"boundary_{side}": polyline for side, polyline in edges.items()}
         np.savez(tmp_path / f"{name}.npz", points=points, **sides)
     np.savez(tmp_path / "nan.npz", points=np.nan * points, **sides)
-    np.savez(tmp_path / "grid.npz", grid=wavy_grid(10, 10))  # as many: one program
+    np.savez(tmp_path / "grid.npz", grid=wavy_grid(20, 20))  # as many: one program
     (tmp_path / "garbage.npz").write_text("no points")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAXFIT_CACHE_DIR", "off")
@@ -67,8 +67,8 @@ def test_bad_files_are_reported_and_passed_over(folder, capsys):
     assert "NaN" in table["nan.npz"]["error"]
     assert sorted(os.listdir("out")) == [*GOOD, "table.csv", "table.jsonl"]
     for name in GOOD:
-        assert read_surface(f"out/{name}").shape == (6, 6)
-        assert (table[name]["net"], table[name]["status"]) == ("6x6", "fitted")
+        assert read_surface(f"out/{name}").shape == (8, 8)
+        assert (table[name]["net"], table[name]["status"]) == ("8x8", "fitted")
         assert table[name]["method"] == "OrthogonalDistance"
         assert 0 < table[name]["average_error_percent"] < 1
 

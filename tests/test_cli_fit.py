@@ -80,7 +80,7 @@ def test_every_method_interpolates_a_grid(folder, capsys, argv):
 
 
 def test_a_tolerance_out_of_reach_is_told(folder):
-    argv = "fit cloud.npz -o s.npz --net 5x5 --tol-maximum 1e-9 --max-steps 5 --no-picture".split()
+    argv = "fit cloud.npz -o s.npz --net 8x8 --tol-maximum 1e-9 --max-steps 5 --no-picture".split()
     assert _cli.main([*argv, "--quiet"]) == 1
     assert (folder / "s.npz").is_file()
 

@@ -165,9 +165,9 @@ def test_points_on_the_border_coincident_ones_and_weights_of_zero_have_the_right
 
 def test_a_surface_that_is_not_at_rest_says_so():
     early = dict(max_steps=2, tol_average=1e-12, weights=WEIGHTS)
-    fit = jf.approximate(POINTS, BASE, **early, adjoint=jf.ImplicitAdjoint(polish_steps=0))
+    fit = jf.approximate(POINTS, BASE, PLATE, **early, adjoint=jf.ImplicitAdjoint(polish_steps=0))
     assert float(fit.stats["stationarity"]) > 1e-4
-    assert "stationarity" not in jf.approximate(POINTS, BASE, **early).stats
+    assert "stationarity" not in jf.approximate(POINTS, BASE, PLATE, **early).stats
 
 
 @pytest.mark.parametrize("method", slow_except([PLATE, REGULAR], PLATE), ids=["plate", "default"])

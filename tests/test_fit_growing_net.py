@@ -67,14 +67,15 @@ def test_the_first_net_shows_the_waves_of_the_sides():
 
 
 def test_errors_of_neighbours_are_alike_where_the_net_is_too_coarse():
+    method = jf.GeometricApproximation()
     for noise, least, most in ((0.0, 0.6, 1.0), (0.05, -0.1, 0.1)):
         points = CLEAN + noise * np.random.default_rng(1).normal(size=CLEAN.shape)
-        fit = jf.fit_points(points, BOUNDARY, net=(8, 8), max_steps=3)
+        fit = jf.fit_points(points, BOUNDARY, net=(8, 8), method=method, max_steps=10)
         found = errors_of_neighbours(fit, points)
         assert least < found.correlation < most
         assert float(fit.average_error) < found.farthest <= float(fit.maximum_error)
         points[5] += 10.0
-        far = jf.approximate(points, fit.surface, max_steps=0)
+        far = jf.approximate(points, fit.surface, method, max_steps=0)
         assert least - 0.05 < errors_of_neighbours(far, points).correlation < most
 
 

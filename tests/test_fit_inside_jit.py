@@ -84,7 +84,8 @@ def test_single_and_half_precision_are_fitted_in_the_sessions_own(method):
 
 def test_throw_raises_whatever_is_made_of_the_fit():
     def net(points):
-        fit = jf.approximate(points, BASE, tol_average=1e-15, max_steps=2, throw=True)
+        options = dict(tol_average=1e-15, max_steps=2, throw=True)
+        fit = jf.approximate(points, BASE, jf.GeometricApproximation(), **options)
         return fit.surface.control_points
 
     with pytest.raises(Exception, match="did not converge"):

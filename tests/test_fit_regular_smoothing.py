@@ -26,10 +26,17 @@ def pocketed():
     return np.concatenate([flat, bowl]), np.arange(1500) >= 1350
 
 
+BOUNDARY = jf.Boundary(**grid_edges(sheet(*np.meshgrid(*2 * [np.linspace(0, 1, 33)], indexing="ij"))))
+
+
 @pytest.fixture(scope="module")
 def base():
-    grid = sheet(*np.meshgrid(*2 * [np.linspace(0, 1, 33)], indexing="ij"))
-    return jf.base_surface(jf.Boundary(**grid_edges(grid)), net=(14, 14))
+    return jf.base_surface(BOUNDARY, net=(14, 14))
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return jf.base_surface(BOUNDARY, net=(12, 12))
 
 
 @pytest.mark.slow
@@ -74,10 +81,10 @@ def test_noise_is_not_fitted(base):
     assert automatic < 0.6 * away[1e-9]
 
 
-def test_weights_and_units_have_no_influence(base):
+def test_weights_and_units_have_no_influence(coarse):
     points, _ = wavy_cloud(1500)
-    fit = jf.approximate(points, base, tol_average=1e-6, max_steps=5)
-    other = jf.BSplineSurface(64.0 * base.control_points, base.knots_u, base.knots_v)
+    fit = jf.approximate(points, coarse, tol_average=1e-6, max_steps=5)
+    other = jf.BSplineSurface(64.0 * coarse.control_points, coarse.knots_u, coarse.knots_v)
     scaled = jf.approximate(64.0 * points, other, tol_average=1e-6, max_steps=5, weights=np.full(1500, 4.0))
     assert np.abs(np.asarray(scaled.surface.control_points) / 64 - fit.surface.control_points).max() < 1e-6
 
@@ -171,13 +178,10 @@ def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time
             np.testing.assert_array_less(after.factor, 8.0)
 
 
-def test_a_fit_that_ends_early_is_not_smoothed_once_more():
+def test_a_fit_that_ends_early_is_not_smoothed_once_more(coarse):
     points, _ = pocketed()
-    base = jf.base_surface(
-        jf.Boundary.from_grid(sheet(*np.meshgrid(*2 * [np.linspace(0, 1, 33)], indexing="ij"))), net=(12, 12)
-    )
     averages = [
-        np.asarray(jf.approximate(points, base, tol_average=1e-6, max_steps=steps).history.average)
+        np.asarray(jf.approximate(points, coarse, tol_average=1e-6, max_steps=steps).history.average)
         for steps in (30, 40)
     ]
     assert averages[0].size == 31

@@ -77,7 +77,9 @@ def test_what_was_read_is_fitted_as_it_is():
         net, jf.interpolate(grid, jf.StandardInterpolation()).surface.control_points
     )
     base = jf.base_surface(edges, net=(6, 6))
-    fits = [jf.approximate(x, base, max_steps=0) for x in (read, grid.reshape(-1, 3))]
+    fits = [
+        jf.approximate(x, base, jf.GeometricApproximation(), max_steps=0) for x in (read, grid.reshape(-1, 3))
+    ]
     np.testing.assert_array_equal(fits[0].errors, fits[1].errors)
 
 

@@ -227,7 +227,7 @@ def test_a_cloud_that_missed_its_tolerance_tells_of_folds_in_a_sentence_of_their
     net = np.array(base.control_points)
     net[3] += [0.6, 0.0, 0.0]
     folded = jf.BSplineSurface(net, base.knots_u, base.knots_v)
-    fit = jf.approximate(points, folded, tol_average=1e-9, max_steps=0)
+    fit = jf.approximate(points, folded, jf.GeometricApproximation(), tol_average=1e-9, max_steps=0)
     assert not bool(fit.converged)
     assert "average 1e-07 %, maximum without limit" in str(fit)
     assert f" The surface folds at {fit.regularity.folds} of 79,600 places: smooth it more," in fit.message

@@ -88,7 +88,7 @@ def test_points_that_are_left_out_are_counted_and_keep_their_places(fit):
 
 @pytest.mark.parametrize("value", [-9999.0, -32768.0, 3.4028235e38])
 def test_numbers_that_stand_for_no_data_are_left_out_and_counted(fit, value):
-    points = scan()
+    points = scan(1000)
     marked = points.copy()
     marked[:, 2] = np.where(np.hypot(points[:, 0] + 0.5, points[:, 1]) < 0.3, value, points[:, 2])
     count = int((marked[:, 2] == value).sum())
@@ -102,7 +102,8 @@ def test_numbers_that_stand_for_no_data_are_left_out_and_counted(fit, value):
 
 def test_a_height_that_looks_like_no_data_among_others_is_data():
     x, y = (a.ravel() for a in np.meshgrid(np.linspace(0, 90, 20), np.linspace(0, 90, 20), indexing="ij"))
-    assert jf.fit_points(np.stack([x, y, 990 + x / 5], axis=1), net=(6, 6), max_steps=2).stats["nodata"] == 0
+    options = dict(net=(6, 6), method=jf.GeometricApproximation(), max_steps=2)
+    assert jf.fit_points(np.stack([x, y, 990 + x / 5], axis=1), **options).stats["nodata"] == 0
     for value, others in ((999.0, 980.0), (9999.0, 9990.0), (-9999.0, -9990.0)):
         heights = np.where(x > 40, value, others + x / 5)
         assert not is_nodata(np.stack([x, y, heights], axis=1)).any()
@@ -221,7 +222,8 @@ def test_what_a_file_holds_is_fitted_as_it_is(tmp_path):
     path.write_text("\n".join([f"OFF\n{len(points)} {len(faces)} 0", *rows]) + "\n")
     read = jf.io.read_points(path)
     np.testing.assert_array_equal(read.faces, faces)
-    fit = jf.fit_points(read, net=(6, 5), max_steps=2)
+    options = dict(net=(6, 5), method=jf.GeometricApproximation(), max_steps=2)
+    fit = jf.fit_points(read, **options)
     assert fit.stats["points_read"] == 30
-    given = jf.fit_points(points, faces=faces, net=(6, 5), max_steps=2)
+    given = jf.fit_points(points, faces=faces, **options)
     np.testing.assert_array_equal(fit.surface.control_points, given.surface.control_points)
