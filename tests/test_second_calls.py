@@ -1,4 +1,6 @@
-"""A call that is differentiated or batched a second time compiles nothing, outside `jit` too."""
+"""Outside `jit`, a call that is differentiated or batched gives what it gives inside, and a second one compiles
+nothing.
+"""
 
 from functools import partial
 
@@ -54,6 +56,8 @@ def test_a_second_one_compiles_nothing(name, how):
         second = HOW[how](function)(jnp.asarray(argument))
     assert compiled.count == 0
     np.testing.assert_array_equal(first, second)
+    inside = jax.jit(HOW[how](function))(jnp.asarray(argument))
+    np.testing.assert_allclose(first, inside, rtol=1e-7, atol=1e-7 * float(np.abs(inside).max()))
 
 
 def test_grad_alone_searches_as_a_plain_call_does():

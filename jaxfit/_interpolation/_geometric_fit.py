@@ -91,7 +91,9 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
         data, start.knots, start.averaged, start.feet, frame.diagonal, frame.goal, foot_tolerance
     )
     how = with_larger_stall_gain(method) if concrete and method.solve_stalled else method
-    loop = _iterated(how, lax.stop_gradient(inputs) if not concrete else inputs, frame.max_steps, progress)
+    # Without a derivative no feet need to be remembered.
+    how = dataclasses.replace(how, adjoint=ImplicitAdjoint()) if concrete else how
+    loop = _iterated(how, inputs if concrete else lax.stop_gradient(inputs), frame.max_steps, progress)
     end, shape = loop.current, data.shape[:2]
     net, here = end.surface.control_points, end.projection
     if symmetry is not None:
@@ -143,11 +145,9 @@ def _check(method: Any, inner: Any, start: Start, symmetry: Reflection | None) -
 
 
 def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress | None) -> LoopState:
-    concrete = is_concrete(inputs)
+    concrete = is_concrete(inputs)  # as they are in a derivative outside jit, which is stopped here
     xp: Any = np if concrete else jnp
-    # Without derivatives no feet need to be remembered.
-    adjoint = ImplicitAdjoint() if concrete else method.adjoint
-    method = dataclasses.replace(method, symmetry=None, adjoint=adjoint, solve_stalled=False)
+    method = dataclasses.replace(method, symmetry=None, solve_stalled=False)
     target = inputs.data.reshape(-1, inputs.data.shape[2]).T
     # The net fixes the size, so points are not padded.
     ones, real = np.ones(target.shape[1], target.dtype), np.ones(target.shape[1], bool)
