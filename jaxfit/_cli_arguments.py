@@ -27,7 +27,7 @@ OUTPUT  .npz  control_points, knots_u, knots_v, order; loops of a trimmed surfac
 _EPILOG = """\
 exit codes:
   0  fitted and written
-  1  written, but the requested tolerance was not reached
+  1  written, but a tolerance that was given was not reached (of the default one the table tells)
   2  bad input or usage, or a file cannot be written
   3  the fit failed numerically, nothing is written
 
@@ -47,7 +47,7 @@ file, are not fitted again, so a run that was interrupted goes on where it stopp
 _BATCH_EPILOG = """\
 exit codes:
   0  all files fitted
-  1  all fitted, but the requested tolerance was not reached in some
+  1  all fitted, but a tolerance that was given was not reached by some
   2  bad usage, or the folder cannot be written
   3  some files failed: their rows and stderr say why
 

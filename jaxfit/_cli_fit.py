@@ -68,6 +68,11 @@ class FitOfFile:
             raise io.InputError(
                 f"--hole-length is for points without a boundary, but {args.input} has one; leave it out."
             )
+        if args.base is not None and self.boundary is None and not interpolates(self.method):
+            raise io.InputError(
+                f"--base is for points with a boundary, but {args.input} has none; leave it out, or "
+                "give one by --boundary."
+            )
 
     def run(self, progress: Any = None) -> FittedFile:
         """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""

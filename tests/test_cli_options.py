@@ -155,6 +155,12 @@ def test_a_hole_length_is_for_points_without_boundary(fits, folder, capsys):
     assert run("bare.xyz", "--hole-length", "0") == 2
 
 
+def test_a_base_is_for_points_with_a_boundary(fits, folder, capsys):
+    assert run("bare.xyz", "--base", "meshless") == 2
+    assert "--base is for points with a boundary, but bare.xyz has none" in capsys.readouterr().err
+    assert not fits.made
+
+
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [

@@ -1,5 +1,7 @@
 """Algorithm 1, plain: each step is the paper's, errors are true distances, and nothing is NaN."""
 
+import dataclasses
+import re
 import subprocess
 import sys
 
@@ -230,10 +232,20 @@ def test_a_base_that_meets_the_tolerances_is_returned_and_said_to_be_it(base):
     assert fit.message.startswith("all tolerances are met by the base surface, which is returned; lower")
     closer = jf.approximate(POINTS, base, tol_average=6e-4)
     assert closer.message == "all tolerances are met."
+    grown = dataclasses.replace(fit, stats=fit.stats | {"growth_steps": 5})
+    assert grown.message == "all tolerances are met."  # of a scan each net begins anew
+    loops = jf.TrimmedSurface(fit.surface, (np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]),))
+    assert "by the base surface" in dataclasses.replace(grown, trimmed=loops).message
     noisy = POINTS + 0.01 * np.random.default_rng(0).normal(size=POINTS.shape)
     rested = jf.approximate(noisy, base, tol_average=0.0)
     assert rested.result == jf.RESULTS.stalled
     assert rested.message == "the errors have stopped falling."  # there is no tolerance to loosen
+
+
+def test_points_that_lie_mostly_beyond_the_border_are_told(base):
+    wide = POINTS * [2.0, 2.0, 1.0] - [0.5, 0.5, 0.0]
+    fit = jf.approximate(wide, base, jf.GeometricApproximation(), max_steps=0)
+    assert re.match(r"the tolerances are not met\. 9\d% of all errors .* beyond the border", fit.message)
 
 
 def test_held_and_untouched_control_points_keep_every_bit(base):

@@ -183,6 +183,12 @@ def test_a_derivative_far_from_rest_is_refused(method):
     np.testing.assert_allclose(slope(jf.ImplicitAdjoint()), slope(None), rtol=1e-9, atol=1e-12)
 
 
+def test_a_derivative_not_quite_at_rest_comes_with_a_warning():
+    slope = partial(jax.grad(height_of), POINTS, WEIGHTS, max_steps=5)
+    with pytest.warns(UserWarning, match=r"may be far off: .* \(stationarity 1.8e-04, more than 1e-06\)"):
+        slope(adjoint=jf.ImplicitAdjoint(polish_steps=0))
+
+
 def test_methods_that_do_not_come_to_rest_refuse_before_they_fit():
     steps = []
     for method in (jf.GeometricApproximation.paper(), jf.GeometricApproximation(local=True)):

@@ -94,6 +94,8 @@ def test_what_makes_no_valid_face_is_not_written(tmp_path, monkeypatch):
     need("OCP")
     with pytest.raises(ValueError, match=r"at least 0\.0001 across .* use a smaller unit\.$"):
         write_surface(tmp_path / "s.step", moved(wavy_surface(), 1e-5))
+    with pytest.raises(ValueError, match=r"at most 4e\+08 across .* use a larger unit\.$"):
+        write_surface(tmp_path / "s.step", moved(wavy_surface(), 1e9))
 
     class Never:
         def __init__(self, shape):

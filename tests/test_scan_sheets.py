@@ -188,6 +188,14 @@ def test_scan_lines_with_few_points_across_make_one_sheet(lines):
     assert np.allclose(np.ptp(sheet.places, axis=0), sheet.sides, rtol=1e-9)
 
 
+def test_a_narrow_strip_is_no_scan_line():
+    x, y = np.random.default_rng(0).uniform(-1, 1, (2, 3000)) * [[1.0], [0.025]]
+    sheet = sheet_of(np.stack([x, y, 0.3 * np.sin(2.5 * x) * np.cos(2 * y)], axis=1))
+    assert len(sheet.nodes) > 2900
+    assert sheet.hole_length < 0.04
+    assert sheet.area == pytest.approx(0.11, rel=0.1)
+
+
 def test_a_band_with_a_twist_of_triangles_is_no_manifold():
     faces = np.array([[0, 1, 2], [0, 1, 3], [2, 1, 4]])
     kept = manifold(faces)

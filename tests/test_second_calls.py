@@ -1,6 +1,4 @@
-"""Outside `jit`, a call that is differentiated or batched gives what it gives inside, and a second one compiles
-nothing.
-"""
+"""Derivatives and batches outside `jit` are those inside, and a second call of them compiles nothing."""
 
 from functools import partial
 

@@ -55,7 +55,8 @@ class GeneralizedCrossValidation(AbstractSmoothing):
     The noise need not be known. It must be independent from point to point, and the parameters must not
     follow it. They do follow it on a base made with the points (`Meshless`) where the noise is as large as
     the distances between points. lambda is then too small by orders of magnitude, and `Discrepancy` is the
-    better choice. Golub, Heath and Wahba, Technometrics 21 (1979).
+    better choice. In the derivative of a fit the lambda that was found counts as a constant. Golub, Heath and
+    Wahba, Technometrics 21 (1979).
 
     Parameters
     ----------

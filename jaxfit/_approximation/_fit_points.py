@@ -19,8 +19,8 @@ from jaxfit._base import (
     Boundary,
     Coons,
     base_surface,
-    check_boundary,
     check_net_of_cloud,
+    checked_boundary,
     checked_net,
     default_base,
     default_net,
@@ -169,7 +169,7 @@ def fit_points(
         points, boundary, faces = _parts(points, boundary, faces)
     if boundary is None and not isinstance(points, Boundary):
         return _without_boundary(points, faces, hole_length, net, order, method, base, options)
-    check_boundary(boundary, points)
+    boundary = checked_boundary(boundary, points)
     check_kind("base", base, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     for name, value in (("faces", faces), ("hole_length", hole_length)):
         if value is not None:

@@ -5,6 +5,7 @@ The fit runs on its inputs without their derivatives. Its result then passes thr
 polished, and the derivative is that of the polished surface in the inputs.
 """
 
+import warnings
 from functools import partial
 from typing import Any
 
@@ -37,7 +38,8 @@ from jaxfit._splines._lookup import windows
 
 # Relative accuracy of the linear system of a derivative, in roots of the rounding unit.
 ACCURACY = 0.75
-TRUSTED = 1e-3  # a greater |G|, relative to its terms, is of no surface near rest
+TRUSTED = 1e-3  # a greater |G|, relative to its terms, is of no surface near rest,
+RELIABLE = 1e-6  # and from this one on digits are lost
 
 
 class FitInputs(eqx.Module):
@@ -112,7 +114,9 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
-    """Raise where the derivative would be that of no surface; within `jit` the number is all there is."""
+    """Raise where the derivative would be that of no surface, warn where it is inaccurate; within `jit` the
+    number is all there is.
+    """
     if not is_concrete(stationarity):
         return
     found, goal = float(np.max(np.asarray(stationarity))), adjoint.goal(np.asarray(stationarity).dtype)
@@ -122,6 +126,13 @@ def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
             f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, goal):.0e}); fit by "
             "OrthogonalDistance with a number as smoothing, take fewer control points, or pass "
             "ImplicitAdjoint(polish_steps=...) with more steps or UnrolledAdjoint()."
+        )
+    if found > max(RELIABLE, goal):
+        warnings.warn(
+            "the derivative may be far off: the surface is not quite at rest (stationarity "
+            f"{found:.1e}, more than {max(RELIABLE, goal):.0e}). Compare it with a difference, or fit "
+            "by OrthogonalDistance with a number as smoothing.",
+            stacklevel=2,
         )
 
 

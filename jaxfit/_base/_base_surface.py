@@ -4,7 +4,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base._base_method import AbstractBaseMethod, Coons
-from jaxfit._base._boundary import Boundary, centre_and_size, check_boundary, farthest
+from jaxfit._base._boundary import Boundary, centre_and_size, checked_boundary, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._default_net import checked_net, default_net
@@ -94,7 +94,7 @@ def base_surface(
     >>> surface.shape, surface.order, surface(1.0, 1.0).tolist()
     ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
-    check_boundary(boundary, points)
+    boundary = checked_boundary(boundary, points)
     net = _checked_net(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")

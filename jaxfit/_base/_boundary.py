@@ -98,11 +98,12 @@ class Boundary(eqx.Module):
         return cls(v0=data[:, 0], v1=data[:, -1], u0=data[0], u1=data[-1])
 
 
-def check_boundary(boundary: Any, points: Any) -> None:
-    """Raise unless `boundary` is one, and say so where the points took its place."""
+def checked_boundary(boundary: Any, points: Any) -> Boundary:
+    """`boundary`, if it is one; raises otherwise, and says so where the points took its place."""
     if isinstance(points, Boundary):
         raise TypeError("points must be an array, but is a Boundary; pass it as boundary=.")
     check_kind("boundary", boundary, Boundary, "Boundary(v0, v1, u0, u1) or Boundary.from_grid(grid)")
+    return boundary
 
 
 def diagonal(*sets: np.ndarray) -> float:

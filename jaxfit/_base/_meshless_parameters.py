@@ -6,7 +6,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfit._base._boundary import Boundary, check_boundary
+from jaxfit._base._boundary import Boundary, checked_boundary
 from jaxfit._base._delaunay_stars import Stars, mean_value_weights, stars
 from jaxfit._base._douglas_peucker import chord_lengths, densify
 from jaxfit._base._normalised_cloud import cloud_of
@@ -95,7 +95,7 @@ def meshless_parameters(
     >>> bool(np.allclose(u, x[1:-1, 1:-1].ravel(), atol=1e-6))
     True
     """
-    check_boundary(boundary, points)
+    boundary = checked_boundary(boundary, points)
     check_number("neighbours", neighbours, 6, whole=True)
     check_number("reweightings", reweightings, 0, whole=True)
     if not is_concrete(points, boundary):

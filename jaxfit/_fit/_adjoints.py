@@ -82,8 +82,12 @@ class ImplicitAdjoint(AbstractAdjoint):
     which is before G vanishes, and the derivative there would be wrong by percents. So the surface is first
     polished: Newton steps on G. The fit that is differentiated, and any fit that `adjoint=ImplicitAdjoint()`
     is passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms
-    of the terms of G. Read it: above about 1e-6 the surface could not be polished, and the derivative is not
-    to be trusted; above 1e-3 differentiating raises an ArithmeticError, and inside `jit` may give NaN.
+    of the terms of G. Read it: above 1e-6 the surface could not be polished, and the derivative is not to be
+    trusted; differentiating outside `jit` then warns, and above 1e-3 raises an ArithmeticError. Inside `jit`
+    it may give NaN there.
+
+    A lambda that `GeneralizedCrossValidation` or `Discrepancy` has chosen counts as a constant: differences
+    of fits also hold what its choice changes.
 
     Of an interpolation: the derivative at held parameters and knots, $dP = N(\hat u, \hat v)^{-1} dQ$. Any
     parameters at which the surface meets the data solve the interpolation problem, so this is the derivative

@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from jaxfit._fit._result import Fit
 
 
-FAR, MUCH = 4.0, 0.05  # times the average error; of the sum of errors
+FAR, MUCH, MOST = 4.0, 0.05, 0.5  # times the average error; of the sum of errors
 MANY_HOLES = 20
 _REMEDIES = {
     True: "look there whether the grid's points are in order, and none repeats its neighbour "
     "(fit.regularity.fold_parameters)",
     False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
 }  # by whether the fit is an interpolation
+_REMEDY_OF_SCANS = "smooth it more, loosen the tolerances, or give a boundary of a part that is less bent"
 
 
 def facts(fit: Any) -> dict[str, str]:
@@ -167,18 +168,25 @@ def _largest_group(found: Regularity) -> str:
 
 
 def _moves(fit: Any) -> int:
-    """Iterations, with those of all nets before the last."""
-    return int(fit.stats["num_steps"]) + int(fit.stats.get("growth_steps", 0))
+    """Iterations that have made the surface: with those of the nets before, but of a scan each net begins
+    anew.
+    """
+    before = 0 if fit.trimmed is not None else int(fit.stats.get("growth_steps", 0))
+    return int(fit.stats["num_steps"]) + before
 
 
 def _share_at_border(fit: Any) -> float:
     """What points far from the surface whose feet are on its border add to the sum of all errors."""
     errors = np.asarray(fit.errors)
-    at_ends = [
-        np.isin(np.asarray(x), np.asarray(limits))
-        for x, limits in zip((fit.u, fit.v), fit.surface.domain, strict=True)
-    ]
-    beyond = (at_ends[0] | at_ends[1]) & (errors > FAR * float(fit.average_error))
+    at_ends = np.any(
+        [
+            np.isin(np.asarray(x), np.asarray(limits))
+            for x, limits in zip((fit.u, fit.v), fit.surface.domain, strict=True)
+        ],
+        axis=0,
+    )
+    usual = np.mean(errors, where=~at_ends) if not at_ends.all() else 0.0
+    beyond = at_ends & (errors > FAR * usual)
     return float(errors[beyond].sum() / max(errors.sum(), np.finfo(float).tiny))
 
 
@@ -194,6 +202,7 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = "the errors have stopped falling."
     of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
+        sentence = "the tolerances are not met." if share > MOST else sentence  # whatever else was noticed
         sentence = (
             f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "
             "this is not where they end; if the method holds it, free it by border=FreeBorder()."
@@ -208,7 +217,8 @@ def said_reason(fit: Any, sentence: str) -> str:
     if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
     where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
-    folds = f"the surface folds at {where}: {_REMEDIES[not _is_of_cloud(fit)]}."
+    remedy = _REMEDY_OF_SCANS if fit.trimmed is not None else _REMEDIES[not _is_of_cloud(fit)]
+    folds = f"the surface folds at {where}: {remedy}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"

@@ -14,15 +14,18 @@ NEIGHBOURS = 16, 64, 256  # of a point: more of them are on a line that is itsel
 NARROW = 0.35  # where their spread across it is so small a part of that along it,
 NARROW_SHARE = 0.2  # and the cloud is on lines where as many of its points are
 ENOUGH = 2000  # points to tell
-LEAST_NODES = 100
+PART = 8  # neighbours are at most one in so many points, or they are no neighbours
 
 
 def thinned_along_lines(points: Float[Any, "points 3"]) -> Float[Any, "nodes 3"]:
-    """Of points on lines so few, evenly chosen, that neighbours are on several lines; of others all."""
+    """Of points on lines so few, evenly chosen, that neighbours are on several lines; of others all.
+
+    Where they never are, the sheet is a strip, as narrow as the lines would be.
+    """
     nodes = points
     while on_lines(nodes):
         nodes = nodes[even_choice(nodes, len(nodes) // 2)]
-        if len(nodes) < LEAST_NODES:
+        if len(nodes) <= PART * NEIGHBOURS[0]:
             return points
     return nodes
 
@@ -35,7 +38,7 @@ def on_lines(points: Float[Any, "points 3"]) -> bool:
     return any(
         _narrow_share(points[tree.query(some, count + 1)[1]]) > NARROW_SHARE
         for count in NEIGHBOURS
-        if count < len(points) / 8
+        if count < len(points) / PART
     )
 
 

@@ -10,6 +10,7 @@ from jaxfit.io._trim_curves import TrimCurve, trim_curves
 
 TOLERANCE = 1e-7  # of a modelling kernel, absolute
 _LEAST_DIAGONAL = 1e-4  # a thousand tolerances
+_LARGEST_DIAGONAL = 4e8  # beyond, coordinates differ by more than the tolerance from one to the next
 _CURVE_TOLERANCE = 1e-6  # of an edge in space from its line on the surface
 _MOST_DEGREE, _MOST_SEGMENTS = 14, 1000  # of an edge in space
 
@@ -22,8 +23,8 @@ def face_of(net: ClampedNet, loops: list[Loop]) -> Any:
     Raises
     ------
     ValueError
-        If the surface is too small for the tolerance of the kernel, or it makes no valid face; if a loop
-        runs along both sides of a seam, or along a side that is a point.
+        If the surface is too small or too large for the tolerance of the kernel, or it makes no valid face;
+        if a loop runs along both sides of a seam, or along a side that is a point.
     """
     from OCP.BRepCheck import BRepCheck_Analyzer
 
@@ -31,6 +32,11 @@ def face_of(net: ClampedNet, loops: list[Loop]) -> Any:
         raise ValueError(
             f"surface must be at least {_LEAST_DIAGONAL:g} across for STEP and IGES, whose readers take "
             f"points closer than {TOLERANCE:g} for one, but is {net.diagonal:.3g}; use a smaller unit."
+        )
+    if not net.diagonal <= _LARGEST_DIAGONAL:
+        raise ValueError(
+            f"surface must be at most {_LARGEST_DIAGONAL:g} across for STEP and IGES, whose readers tell "
+            f"points {TOLERANCE:g} apart, but is {net.diagonal:.3g}; use a larger unit."
         )
     if loops and not _are_the_border(net, loops):
         _check_sides(net, loops)
