@@ -152,7 +152,9 @@ def test_fairing_a_good_base_surface_is_no_stall(base):
 
 def test_local_mode_leaves_alone_what_is_near_enough(base):
     tolerance = 2e-3
-    near = np.asarray(jf.approximate(POINTS, base, max_steps=0).errors) <= tolerance
+    near = (
+        np.asarray(jf.approximate(POINTS, base, jf.GeometricApproximation(), max_steps=0).errors) <= tolerance
+    )
     assert 0.1 < near.mean() < 0.9
     method = plain(local=True)
     fit = jf.approximate(POINTS, base, method, max_steps=1, tol_average=1e-9, tol_maximum=tolerance)
@@ -245,7 +247,11 @@ def test_a_base_that_meets_the_tolerances_is_returned_and_said_to_be_it(base):
 def test_points_that_lie_mostly_beyond_the_border_are_told(base):
     wide = POINTS * [2.0, 2.0, 1.0] - [0.5, 0.5, 0.0]
     fit = jf.approximate(wide, base, jf.GeometricApproximation(), max_steps=0)
-    assert re.match(r"the tolerances are not met\. 9\d% of all errors .* beyond the border", fit.message)
+    assert re.match(
+        r"the maximum number .* tolerances\. 9\d% of all errors .* beyond the border", fit.message
+    )
+    grown = dataclasses.replace(fit, result=jf.RESULTS.noise_reached)
+    assert re.match(r"finer nets bring .* to the points\. 9\d% of all errors", grown.message)
 
 
 def test_held_and_untouched_control_points_keep_every_bit(base):

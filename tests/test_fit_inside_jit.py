@@ -30,7 +30,8 @@ def test_a_cloud_known_while_tracing_is_fitted_there():
     boundary = jf.Boundary(**EDGES)
 
     def point(u):
-        return jf.fit_points(POINTS, boundary, net=(6, 6), base=jf.Meshless()).surface(u, u)
+        options = dict(net=(6, 6), method=jf.GeometricApproximation(), base=jf.Meshless())
+        return jf.fit_points(POINTS, boundary, **options).surface(u, u)
 
     np.testing.assert_allclose(jax.jit(point)(0.3), point(0.3), rtol=1e-12)
     nearest = jax.jit(lambda x: x + jf.closest_point(BASE, POINTS).distance)(0.0)

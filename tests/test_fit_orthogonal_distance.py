@@ -243,6 +243,7 @@ def test_new_knots_go_in_while_it_runs(base):
     assert fit.history.average[-1] < 0.5 * fit.history.average[2]
 
 
+@pytest.mark.slow
 def test_fits_in_transformations(base, fit):
     feet = jf.closest_point(base, POINTS)
     start = (feet.u, feet.v)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow_except
 
 import jaxfit as jf
 
@@ -22,7 +23,7 @@ def cloud(count):
     return np.stack([x, y, 0.1 * np.sin(5 * x) * np.cos(4 * y)], axis=1)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_except(METHODS, jf.StandardApproximation))
 def test_a_net_too_large_for_its_points_stays_within_reach_without_smoothing(method):
     points = cloud(300)
     fit = jf.approximate(points, flat_base(30), method(smoothing=0.0), tol_average=1e-5, max_steps=12)
@@ -34,7 +35,7 @@ def test_a_net_too_large_for_its_points_stays_within_reach_without_smoothing(met
         assert float(fit.stats["shift"]) > 0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_except(METHODS, jf.StandardApproximation))
 def test_a_region_without_points_stays_near_the_base_without_smoothing(method):
     points = cloud(400)
     points = points[~((points[:, 0] > 0.5) & (points[:, 1] > 0.5))]
@@ -69,7 +70,7 @@ def test_a_single_weight_leaves_the_rest_of_the_base(method):
     assert fit.average_error < 0.1
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_except(METHODS, jf.StandardApproximation))
 def test_a_traced_smoothing_that_is_none_is_told(method):
     points, base = cloud(300), flat_base(8)
     fit = jax.jit(lambda x: jf.approximate(points, base, method(smoothing=x), tol_average=1e-5, max_steps=6))

@@ -87,7 +87,8 @@ FORWARD = {
 }
 
 
-@pytest.mark.parametrize("name", slow_except(FORWARD, "free border"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORWARD)
 def test_derivatives_follow_new_knots_fairing_and_a_free_border(name):
     points = jnp.asarray(cloud())
     d = directions(points)

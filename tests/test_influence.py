@@ -26,7 +26,7 @@ def base():
     return jf.base_surface(jf.Boundary(**EDGES), net=(7, 6))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", slow_except(METHODS, "geometric", "standard", "default"))
 def test_points_of_weight_zero_have_no_influence(base, name):
     # 224 points are padded as 200 are, and share their program; 300 are not.
     count = 100 if name in ("geometric", "default") else 24

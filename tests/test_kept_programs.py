@@ -171,6 +171,7 @@ def test_a_value_without_a_lasting_name_has_no_key(value):
         _kept_programs._spelled(value)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_without_kept_programs(kept):
     grid = wavy_grid(8, 7)
 

@@ -103,7 +103,7 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys):
     points, edges = wavy_cloud(200)
     np.savez("cloud.npz", points=points, **{f"boundary_{side}": line for side, line in edges.items()})
     argv = "fit cloud.npz -o s.npz --net 6x6 --max-steps 3 --tol-average 5 --loss huber --no-picture".split()
-    assert _cli.main([*argv, "--report", "r.html"]) == 0
+    assert _cli.main([*argv, *"--method geometric --report r.html".split()]) == 0
     page = Page((tmp_path / "r.html").read_text())
     assert page.headings[:4] == ["cloud", "Input", "Settings", "Output"]
     pairs = dict(zip(page.cells[::2], page.cells[1::2], strict=True))

@@ -202,7 +202,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = "the errors have stopped falling."
     of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
-        sentence = "the tolerances are not met." if share > MOST else sentence  # whatever else was noticed
+        if share > MOST and fit.result == RESULTS.noise_reached:  # that is not noise
+            sentence = "finer nets bring the surface no nearer to the points."
         sentence = (
             f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "
             "this is not where they end; if the method holds it, free it by border=FreeBorder()."

@@ -45,7 +45,8 @@ def read_scan(path: Path) -> tuple[Points, Counts, Faces | None]:
         raise InputError(f"{path} holds more than there is memory for; thin the points.") from error
     except Exception as error:  # a parser may raise anything on a damaged file
         raise InputError(
-            f"{path} is no {suffix} file that can be read ({_one_line(error)}); write it again."
+            f"{path} is no {suffix} file that can be read, or was cut short ({_one_line(error)}); "
+            "write it again."
         ) from error
     return points, {reason: count for reason, count in left_out.items() if count}, faces
 
