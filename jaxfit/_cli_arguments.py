@@ -27,7 +27,7 @@ OUTPUT  .npz  control_points, knots_u, knots_v, order; loops of a trimmed surfac
 _EPILOG = """\
 exit codes:
   0  fitted and written
-  1  written, but a tolerance that was given was not reached (of the default one the table tells)
+  1  written, but a tolerance that was given was not reached (a missed default shows in the table only)
   2  bad input or usage, or a file cannot be written
   3  the fit failed numerically, nothing is written
 

@@ -15,14 +15,15 @@ if TYPE_CHECKING:
     from jaxfit._fit._result import Fit
 
 
-FAR, MUCH, MOST = 4.0, 0.05, 0.5  # times the average error; of the sum of errors
+FAR = 4.0  # times the average error of points inside the border
+MUCH, MOST = 0.05, 0.5  # shares of the sum of errors
 MANY_HOLES = 20
 _REMEDIES = {
-    True: "look there whether the grid's points are in order, and none repeats its neighbour "
+    "grid": "look there whether the grid's points are in order, and none repeats its neighbour "
     "(fit.regularity.fold_parameters)",
-    False: "smooth it more, loosen the tolerances, or start from a base surface without folds",
-}  # by whether the fit is an interpolation
-_REMEDY_OF_SCANS = "smooth it more, loosen the tolerances, or give a boundary of a part that is less bent"
+    "cloud": "smooth it more, loosen the tolerances, or start from a base surface without folds",
+    "scan": "smooth it more, loosen the tolerances, or give a boundary of a part that is less bent",
+}
 
 
 def facts(fit: Any) -> dict[str, str]:
@@ -218,8 +219,8 @@ def said_reason(fit: Any, sentence: str) -> str:
     if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
     where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
-    remedy = _REMEDY_OF_SCANS if fit.trimmed is not None else _REMEDIES[not _is_of_cloud(fit)]
-    folds = f"the surface folds at {where}: {remedy}."
+    kind = "grid" if not _is_of_cloud(fit) else "cloud" if fit.trimmed is None else "scan"
+    folds = f"the surface folds at {where}: {_REMEDIES[kind]}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"

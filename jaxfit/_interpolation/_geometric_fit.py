@@ -145,7 +145,8 @@ def _check(method: Any, inner: Any, start: Start, symmetry: Reflection | None) -
 
 
 def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress | None) -> LoopState:
-    concrete = is_concrete(inputs)  # as they are in a derivative outside jit, which is stopped here
+    # Under `grad` outside `jit` they are: `stop_gradient` leaves values. So this says nothing of derivatives.
+    concrete = is_concrete(inputs)
     xp: Any = np if concrete else jnp
     method = dataclasses.replace(method, symmetry=None, solve_stalled=False)
     target = inputs.data.reshape(-1, inputs.data.shape[2]).T

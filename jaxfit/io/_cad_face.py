@@ -10,7 +10,7 @@ from jaxfit.io._trim_curves import TrimCurve, trim_curves
 
 TOLERANCE = 1e-7  # of a modelling kernel, absolute
 _LEAST_DIAGONAL = 1e-4  # a thousand tolerances
-_LARGEST_DIAGONAL = 4e8  # beyond, coordinates differ by more than the tolerance from one to the next
+_LARGEST_DIAGONAL = 4e8  # there float64 numbers are about the tolerance apart
 _CURVE_TOLERANCE = 1e-6  # of an edge in space from its line on the surface
 _MOST_DEGREE, _MOST_SEGMENTS = 14, 1000  # of an edge in space
 

@@ -134,7 +134,7 @@ def read_boundary(path: str | os.PathLike) -> Boundary:
 def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
     """Raise unless `path` is a file that is not empty and has one of these suffixes."""
     if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file in it, or of a batch all its files as {path}/*.")
+        raise InputError(f"{path} is a folder; name a file in it ({path}/* names all to `jaxfit batch`).")
     if not path.exists():
         raise InputError(f"{path} does not exist; check its name and folder.")
     if path.suffix.lower() not in suffixes:
