@@ -164,12 +164,12 @@ def folds(surface, samples=200):
 
 # ---------------------------------------------------------------- compile counts
 
-_compilations = 0
+_compiled = []  # names of programs
 
 
-def _listen(event, duration, **kwargs):
-    global _compilations
-    _compilations += event == "/jax/core/compile/backend_compile_duration"
+def _listen(event, duration, fun_name="", **kwargs):
+    if event == "/jax/core/compile/backend_compile_duration":
+        _compiled.append(fun_name)
 
 
 jax.monitoring.register_event_duration_secs_listener(_listen)
@@ -177,7 +177,8 @@ jax.monitoring.register_event_duration_secs_listener(_listen)
 
 @contextmanager
 def count_compilations():
-    """`with count_compilations() as compiled: ...` and then `compiled.count`."""
-    result, before = SimpleNamespace(count=0), _compilations
+    """`with count_compilations() as compiled: ...` and then `compiled.count`, or `compiled.names`."""
+    result, before = SimpleNamespace(count=0, names=[]), len(_compiled)
     yield result
-    result.count = _compilations - before
+    result.names = _compiled[before:]
+    result.count = len(result.names)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import diagonal
+from helpers import count_compilations, diagonal
 
 import jaxfit as jf
 from jaxfit._approximation._errors_of_neighbours import errors_of_neighbours
@@ -41,6 +41,19 @@ def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
     assert coarse.surface.shape == (8, 8)
 
 
+def test_nets_of_one_stage_share_their_programs(grown):
+    """Compiling another for each takes most of the time of a first fit."""
+    points = CLEAN[: COUNT // 2]
+    first = jf.fit_points(points, BOUNDARY, tol_average=1e-2)
+    with count_compilations() as compiled:
+        other = jf.fit_points(points, BOUNDARY, tol_average=1e-4)
+    assert first.surface.shape < other.surface.shape <= grown.surface.shape
+    assert not {"jit(_advance)", "jit(_run)"} & set(compiled.names)
+    with count_compilations() as compiled:
+        jf.closest_point(other.surface, points[:700])
+    assert "jit(_run)" in compiled.names
+
+
 def test_the_first_net_shows_the_waves_of_the_sides():
     """Coarser ones would take them for longer waves, which finer ones do not get rid of."""
 
@@ -50,14 +63,14 @@ def test_the_first_net_shows_the_waves_of_the_sides():
     line, zero = np.linspace(0, 1, 400), np.zeros(400)
     sides = wavy(line, zero), wavy(line, zero + 1), wavy(zero, line), wavy(zero + 1, line)
     boundary = jf.Boundary(*sides)
-    nets = BoundaryNets(boundary, (4, 4), 5000)
+    nets = BoundaryNets(boundary, (4, 4), np.zeros((5000, 3)))
     nu, nv = nets.net(8.0, 200)
     assert 2.5 * 12 <= nu <= 6 * 12
     assert nv == 8
     finer = nets.net(18.0, 200)
     assert finer[0] == int(nu * 1.5)
     assert finer[1] > nv
-    assert BoundaryNets(boundary, (4, 4), 400).net(8.0, 200)[0] < 12  # too few points
+    assert BoundaryNets(boundary, (4, 4), np.zeros((400, 3))).net(8.0, 200)[0] < 12  # too few points
     stuttering = jf.Boundary(*(np.repeat(side, 5, axis=0) for side in sides))
     assert net_of_sides(stuttering, (4, 4), 150) == net_of_sides(boundary, (4, 4), 150)
     noise = 0.02 * np.random.default_rng(0).normal(size=(4, 400, 3))

@@ -1,7 +1,7 @@
 """`fit_cloud`: one fit of a cloud, from checked arguments to its result."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxfit._approximation._implicit_fit import (
     polished_fitted,
     with_implicit_derivative,
 )
+from jaxfit._approximation._room import Room, nearest_on
 from jaxfit._approximation._unrolled_fit import unrolled_fit
 from jaxfit._checks import as_points, check_kind, is_concrete, without_derivatives
 from jaxfit._closest import closest_point
@@ -34,15 +35,6 @@ from jaxfit._progress_line import doing
 from jaxfit._splines import BSplineSurface
 
 LEAST_POINTS = 4
-
-
-class Room(NamedTuple):
-    """What a fit has room for: fits with the same room are one program. And the size of the whole cloud, of
-    which it may be given a part."""
-
-    net: tuple[int, int]
-    steps: int
-    points: int
 
 
 def fit_cloud(
@@ -74,7 +66,7 @@ def fit_cloud(
     begun = working_surface(base, unit, concrete)
     if room is not None:
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
-    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud))
+    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, room))
     order = order_by_cell(begun, u, v, cloud.shape[0])
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
@@ -98,7 +90,7 @@ def fit_cloud(
         surface, known, unit, share = _differentiable(given, end, surface, known)
         cloud, concrete = given[0], is_concrete(given)
         stats = stats | {"stationarity": share}
-    parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete)
+    parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete, room)
     stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
     fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
@@ -109,8 +101,11 @@ def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
     doing(f"fitting {net[0]} x {net[1]} control points to {points} points")
 
 
-def _nearest(base: BSplineSurface, cloud: Any) -> tuple[Any, Any]:
+def _nearest(base: BSplineSurface, cloud: Any, room: Room | None) -> tuple[Any, Any]:
     """The parameters of the closest points."""
+    if room is not None:
+        found = nearest_on(base, cloud, room=room)
+        return found["u"], found["v"]
     nearest = closest_point(base, cloud)
     return nearest.u, nearest.v
 
@@ -255,11 +250,12 @@ def _at_feet(
     known: Feet,
     at_feet: bool,
     concrete: bool,
+    room: Room | None,
 ) -> Feet:
     """The feet at which the errors are measured."""
     if not concrete and at_feet:
         return known
-    return (GlobalFeet() if errors is None else errors).feet(surface, cloud, known, at_feet)
+    return (GlobalFeet() if errors is None else errors).feet(surface, cloud, known, at_feet, room)
 
 
 def _fit(

@@ -6,13 +6,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from jaxfit._approximation._room import Room, nearest_on
 from jaxfit._checks import is_concrete
-from jaxfit._closest import Newton, closest_point, nearest_feet
-from jaxfit._precision import default_foot_tolerance
+from jaxfit._closest import closest_point
 from jaxfit._splines import BSplineSurface
-from jaxfit._splines._pieces import make_axis
-
-MAX_STEPS = 60  # evaluations of a foot in the global search
 
 Feet = tuple[Any, Any, Any, Any]  # u, v, distance in the user's unit, converged
 
@@ -21,9 +18,11 @@ class AbstractErrors(eqx.Module):
     """Where the errors of a finished fit are measured."""
 
     @abstractmethod
-    def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
+    def feet(
+        self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool, room: Room | None = None
+    ) -> Feet:
         """Feet on the fitted surface. `known` are the parameters that the fit ended with, and the errors
-        there; `at_feet` says whether these are foot points.
+        there; `at_feet` says whether these are foot points. `room` is that of the fit.
         """
 
 
@@ -39,7 +38,9 @@ class AtParameters(AbstractErrors):
     AtParameters()
     """
 
-    def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
+    def feet(
+        self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool, room: Room | None = None
+    ) -> Feet:
         """The known ones."""
         return known
 
@@ -56,24 +57,26 @@ class LocalFeet(AbstractErrors):
     LocalFeet()
     """
 
-    def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
+    def feet(
+        self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool, room: Room | None = None
+    ) -> Feet:
         """The known ones if they are feet, or else the local feet found from them."""
         if not at_feet:
             found = closest_point(surface, points, start=(known[0], known[1]))
             known = found.u, found.v, found.distance, found.converged
-        return _searched_again(surface, points, known) if is_concrete(surface, points, known) else known
+        return _searched_again(surface, points, known, room) if is_concrete(surface, points, known) else known
 
 
-def _searched_again(surface: BSplineSurface, points: Any, known: Feet) -> Feet:
+def _searched_again(surface: BSplineSurface, points: Any, known: Feet, room: Room | None) -> Feet:
     """With the nearest feet on the whole surface where local ones have not converged and are farther."""
     lost = np.flatnonzero(~np.asarray(known[3]))
     if not len(lost):
         return known
-    found = closest_point(surface, np.asarray(points)[lost])
-    nearer = np.asarray(found.distance) < np.asarray(known[2])[lost]
+    found = _as_feet(nearest_on(surface, np.asarray(points)[lost], room=room))
+    nearer = found[2] < np.asarray(known[2])[lost]
     arrays = [np.array(x) for x in known]
-    for array, new in zip(arrays, (found.u, found.v, found.distance, found.converged), strict=True):
-        array[lost[nearer]] = np.asarray(new)[nearer]
+    for array, new in zip(arrays, found, strict=True):
+        array[lost[nearer]] = new[nearer]
     return arrays[0], arrays[1], arrays[2], arrays[3]
 
 
@@ -91,25 +94,17 @@ class GlobalFeet(AbstractErrors):
     GlobalFeet()
     """
 
-    def feet(self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool) -> Feet:
+    def feet(
+        self, surface: BSplineSurface, points: Any, known: Feet, at_feet: bool, room: Room | None = None
+    ) -> Feet:
         """The nearest feet on the whole surface."""
         if not is_concrete(surface, points, known):
             found = closest_point(surface, points)
             return found.u, found.v, found.distance, found.converged
         if not at_feet:
-            known = LocalFeet().feet(surface, points, known, at_feet)
-        knots = [np.asarray(x) for x in (surface.knots_u, surface.knots_v)]
-        axis_u, axis_v = (make_axis(x, order) for x, order in zip(knots, surface.order, strict=True))
-        net = np.asarray(surface.control_points)
-        tolerance = default_foot_tolerance(net.dtype)
-        found = nearest_feet(
-            Newton(),
-            net,
-            axis_u,
-            axis_v,
-            np.asarray(points),
-            known=known,
-            tolerance=tolerance,
-            max_steps=MAX_STEPS,
-        )
-        return found["u"], found["v"], np.sqrt(found["f"]), found["converged"]
+            known = LocalFeet().feet(surface, points, known, at_feet, room)
+        return _as_feet(nearest_on(surface, points, known, room))
+
+
+def _as_feet(found: Any) -> Feet:
+    return found["u"], found["v"], np.sqrt(found["f"]), found["converged"]

@@ -1,6 +1,7 @@
 """`fit_points`: a base surface from the boundary of a cloud, then a fit."""
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxfit._base import (
     AbstractBaseMethod,
     Boundary,
     Coons,
+    Meshless,
     base_surface,
     check_net_of_cloud,
     checked_boundary,
@@ -189,9 +191,10 @@ def fit_points(
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options
-        nets = BoundaryNets(boundary, order, cloud.shape[0])
-        growth = NetGrowth(np.asarray(cloud), nets, default_method(method), request)
-        return fit_growing(growth, _base(boundary, cloud, growth.net(FIRST_SIZE), order, base))
+        nets = BoundaryNets(boundary, order, np.asarray(cloud))
+        growth = NetGrowth(nets.points, nets, default_method(method), request)
+        first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, nets.meshless)
+        return fit_growing(growth, first)
     net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
     check_net_of_cloud(net, cloud.shape[0])
     return approximate(cloud, _base(boundary, fixed, net, order, base), method, **options)
@@ -211,10 +214,17 @@ def _parts(data: Any, boundary: Any, faces: Any) -> tuple[Any, Any, Any]:
     return data.cloud, boundary, data.faces if faces is None and boundary is None else faces
 
 
-def _base(boundary: Boundary, cloud: Any, net: tuple[int, int], order: tuple[int, int], base: Any) -> Any:
+def _base(
+    boundary: Boundary,
+    cloud: Any,
+    net: tuple[int, int],
+    order: tuple[int, int],
+    base: Any,
+    meshless: Callable[[], AbstractBaseMethod] = Meshless,
+) -> Any:
     if base is None and is_concrete(cloud):
         doing("making a base surface")
-        return default_base(boundary, np.asarray(cloud), net, order)
+        return default_base(boundary, np.asarray(cloud), net, order, meshless)
     return base_surface(boundary, cloud, net=net, order=order, method=base)
 
 

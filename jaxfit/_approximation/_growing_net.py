@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._approximation._cloud_fit import Room, fit_cloud
+from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, errors_of_neighbours
 from jaxfit._approximation._level_nets import FIRST_SIZE, AbstractNets
 from jaxfit._approximation._regular_smoothing import RegularSmoothing
+from jaxfit._approximation._room import Room
 from jaxfit._base import mean_distance_to
+from jaxfit._closest import chunk_size
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._splines import BSplineSurface
@@ -36,10 +38,11 @@ LEAST_POINTS = 500  # of a cloud from which some can be held out
 HELD_OUT = 10  # one in so many points
 # A net is chosen by some of the points of a large cloud: by ENOUGH, or where that is more by
 # POINTS_TO_CHOOSE for each control point.
-ENOUGH, POINTS_TO_CHOOSE = 20_000, 48
-# Nets share a program where each direction has room for the same number of control points: compiling costs
-# more than the surplus ones.
-ROOMS = 24, 50, 96  # beyond, a net has no more than it needs
+ENOUGH, POINTS_TO_CHOOSE = 20_000, 24
+# All nets up to one of these sizes are fitted to the same points by the same program, with room for the
+# largest: compiling another takes longer than the surplus. Beyond, a net has no more than it needs.
+STAGES = tuple(FIRST_SIZE * GROWTH**k for k in (7, 10, 14))
+ROOM = 4  # has room for a multiple of so many control points, so that clouds of similar shape share programs
 # A cloud without outliers is fitted on while one of its points is farther from the surface than so many times
 # the tolerance of the average: that may be met before the fit has come to the ends of a scroll.
 FAR = 10.0
@@ -76,23 +79,30 @@ class NetGrowth:
         average, maximum = request["tol_average"], request["tol_maximum"]
         self.far = np.inf if average is None or maximum is not None else FAR * float(average)
         self.most = float(np.sqrt(len(counted) / nets.points_a_control_point))
+        self.chunk = chunk_size(min(len(counted), ENOUGH))
         self.steps = 0  # iterations so far, of all nets
 
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
         return self.nets.net(size, MOST_SIZE)
 
-    def fit(self, points: Any, base: BSplineSurface, request: dict[str, Any]) -> Fit:
-        """The fit of `points`, in a program for nets of similar size and for any number of iterations."""
-        net = [next((room for room in ROOMS if room >= n), n) for n in base.shape]
-        room = Room((net[0], net[1]), self.request["max_steps"], len(self.points))
+    def _stage(self, size: float) -> float:
+        """The largest size of a net that shares points and program with one of this size."""
+        stage = next((most for most in STAGES if size <= 1.001 * most), size)
+        return max(size, min(stage, self.most))
+
+    def fit(self, points: Any, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
+        """The fit of `points`, in a program for all nets of the stage and for any number of iterations."""
+        largest = zip(base.shape, self.net(self._stage(size)), strict=True)
+        nu, nv = (max(n, -(-most // ROOM) * ROOM) for n, most in largest)
+        room = Room((nu, nv), self.request["max_steps"], len(self.points), self.chunk)
         fit = fit_cloud(points, base, self.method, request, room)
         self.steps += int(fit.stats["num_steps"])
         return fit
 
-    def whole(self, base: BSplineSurface, request: dict[str, Any]) -> Fit:
+    def whole(self, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of all points."""
-        fit = partial(self.fit, self.points, base)
+        fit = partial(self.fit, self.points, size, base)
         return fit_everywhere(fit, request) if self.cleaned else fit(request)
 
     def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
@@ -143,7 +153,7 @@ class NetGrowth:
         }
         if farther:
             request["tol_maximum"] = self.far
-        fit = self.fit(self.points[some], base, request)
+        fit = self.fit(self.points[some], size, base, request)
         beside = errors_of_neighbours(fit, self.points[some])
         return Level(size, fit, float(np.asarray(fit.errors)[held_out].mean()), beside)
 
@@ -175,7 +185,7 @@ class NetGrowth:
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
         most = ENOUGH
-        nu, nv = self.net(size)
+        nu, nv = self.net(self._stage(size))
         while most < POINTS_TO_CHOOSE * nu * nv:
             most *= 2
         some = self.sorted[:: -(-len(self.sorted) // most)]
@@ -225,14 +235,14 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
     request["start"] = growth.nets.feet(growth.net(size))
-    fit = growth.whole(level.fit.surface, request)
+    fit = growth.whole(size, level.fit.surface, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= GROWTH
         if bool(fit.converged) or size > growth.most:
             break
         net = growth.net(size)
         request["start"] = growth.nets.feet(net)
-        fit = growth.whole(growth.nets.carried(fit.surface, net), request)
+        fit = growth.whole(size, growth.nets.carried(fit.surface, net), request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
         fit = dataclasses.replace(fit, result=why)
     before = growth.steps - int(fit.stats["num_steps"])

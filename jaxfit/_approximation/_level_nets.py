@@ -28,6 +28,7 @@ FIRST_SIZE = 8.0  # control points along each direction of a square patch
 MOST_SIZE = 96  # control points along either direction of a sheet, which may be rough at all scales
 
 MOST_FRESH = 64**2  # control points of the largest net that is fitted anew
+MOST_MESHLESS = 20_000  # points whose parameters are found
 MUCH = 1.25
 SIDES_MOST = 150  # control points that the sides are given along either direction to begin with
 
@@ -67,8 +68,7 @@ class BoundaryNets(AbstractNets):
     points_a_control_point = 2.0
     boundary: Boundary
     order: tuple[int, int]
-    points: int
-    _known: MeshlessAt | None = None
+    points: Float[np.ndarray, "points d"]
 
     def net(self, size: float, most: int) -> tuple[int, int]:
         """Shared between the directions by the lengths of the sides; more where the sides have waves, which
@@ -82,7 +82,7 @@ class BoundaryNets(AbstractNets):
     def _least(self) -> tuple[int, int]:
         """What the sides take where the first net has much less; 0 elsewhere."""
         least = net_of_sides(self.boundary, self.order, SIDES_MOST)
-        if self.points_a_control_point * least[0] * least[1] > self.points:
+        if self.points_a_control_point * least[0] * least[1] > len(self.points):
             return 0, 0
         usual = net_of_size(FIRST_SIZE, self.boundary, self.order, SIDES_MOST)
         nu, nv = (n if n > MUCH * other else 0 for n, other in zip(least, usual, strict=True))
@@ -96,9 +96,15 @@ class BoundaryNets(AbstractNets):
         """Smoothed, at parameters that come from neighbours and not from a projection."""
         if points.shape[1] != 3 or net[0] * net[1] > MOST_FRESH:
             return None
-        if self._known is None:
-            self._known = meshless_at(Meshless(), cloud_of(points, self.boundary))
-        return base_surface(self.boundary, points, net=net, order=self.order, method=self._known)
+        return base_surface(self.boundary, points, net=net, order=self.order, method=self.meshless())
+
+    def meshless(self) -> MeshlessAt:
+        """The meshless surface of any net, at parameters that are found once."""
+        return self._meshless
+
+    @cached_property
+    def _meshless(self) -> MeshlessAt:
+        return meshless_at(Meshless(most_points=MOST_MESHLESS), cloud_of(self.points, self.boundary))
 
     def feet(self, net: tuple[int, int]) -> None:
         """To be searched."""

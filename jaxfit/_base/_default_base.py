@@ -1,8 +1,11 @@
 """The default base surface."""
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit._base._base_method import AbstractBaseMethod
 from jaxfit._base._base_surface import base_surface
 from jaxfit._base._boundary import Boundary, diagonal
 from jaxfit._base._directed_projection import mean_distance
@@ -17,6 +20,7 @@ def default_base(
     points: Float[np.ndarray, "points d"],
     net: tuple[int, int],
     order: tuple[int, int],
+    meshless: Callable[[], AbstractBaseMethod] = Meshless,
 ) -> BSplineSurface:
     """The Coons surface, or where that is far from the cloud on average the meshless one, if it is nearer."""
     coons = base_surface(boundary, points, net=net, order=order)
@@ -25,7 +29,7 @@ def default_base(
     distance = mean_distance_to(coons, points)
     if distance <= FAR * diagonal(points):
         return coons
-    other = base_surface(boundary, points, net=net, order=order, method=Meshless())
+    other = base_surface(boundary, points, net=net, order=order, method=meshless())
     return other if mean_distance_to(other, points) < distance else coons
 
 

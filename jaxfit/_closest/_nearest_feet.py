@@ -39,6 +39,7 @@ def nearest_feet(
     tolerance: float,
     max_steps: int,
     used: tuple[int, int] | None = None,
+    chunk: int | None = None,
 ) -> HostFeet:
     """Feet of all points: `u`, `v`, `f` (squared distance), `converged`, `steps`, and `point` on the surface.
 
@@ -46,9 +47,12 @@ def nearest_feet(
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
     then left out. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
-    repeated end knots, `used` says how many are in use along u and v.
+    repeated end knots, `used` says how many are in use along u and v. So
+    many points as `chunk` are projected at a time; by default that depends on how many there are.
     """
-    projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, known is not None)
+    if chunk is None:
+        chunk = chunk_size(len(points) if known is None else min(len(points), FEW))
+    projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     if start is not None:
         best = projector(None, *start)
     else:
@@ -96,15 +100,14 @@ class _Projector:
         points: np.ndarray,
         tolerance: float,
         max_steps: int,
-        few: bool,
+        size: int,
     ):
-        self.method, self.axes, self.dtype = method, axes, np.dtype(net.dtype)
+        self.method, self.axes, self.dtype, self.size = method, axes, np.dtype(net.dtype), size
         net = np.asarray(net, np.float64)
         self.centre = _middle(net)
         self.net = net - self.centre
         self.centred = np.empty(points.shape[::-1])
         np.subtract(points.T, self.centre[:, None], out=self.centred)
-        self.size = chunk_size(min(len(points), FEW) if few else len(points))
         extent = self.dtype.type(tolerance * _extent(self.net, self.centred))
         self.limits = extent, np.int32(max_steps)
 

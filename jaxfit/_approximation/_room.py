@@ -1,0 +1,44 @@
+"""`Room`: what the fits of one cloud have room for, so that one program serves them, and searches in it."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxfit._closest import Newton, nearest_feet
+from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._precision import default_foot_tolerance
+from jaxfit._splines import BSplineSurface
+
+MAX_STEPS = 60  # evaluations of a foot in the global search
+
+
+class Room(NamedTuple):
+    """What a fit has room for: fits with the same room are one program.
+
+    `points` is the size of the whole cloud, of which the fit may be given a part, and `chunk` how many of
+    them are searched for at a time.
+    """
+
+    net: tuple[int, int]
+    steps: int
+    points: int
+    chunk: int
+
+
+def nearest_on(surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None) -> Any:
+    """The nearest feet on the whole surface, all concrete; `known` ones as for `nearest_feet`."""
+    net, u, v = (np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v))
+    whole = WorkingSurface.of(net, u, v)
+    if room is not None:
+        whole = whole.padded(room.net[0] - net.shape[0], room.net[1] - net.shape[1])
+    return nearest_feet(
+        Newton(),
+        whole.control_points,
+        *whole.axes,
+        np.asarray(points),
+        known=known,
+        tolerance=default_foot_tolerance(net.dtype),
+        max_steps=MAX_STEPS,
+        used=net.shape[:2],
+        chunk=None if room is None else room.chunk,
+    )
