@@ -27,7 +27,7 @@ def _options() -> dict[str, Any]:
 
 
 def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: Any) -> Callable[..., Any]:
-    """`jax.jit(function, **jit_options)`, with options that are quick to compile where JAX and XLA allow that.
+    """`jax.jit(function, **jit_options)` with options quick to compile, where JAX and XLA allow them.
 
     JAX takes compiler options for outermost programs only, so a call with traced arguments is an ordinary
     `jit`; so is every call once XLA has said that it does not know the option. Without a traced argument

@@ -1,4 +1,4 @@
-"""Ctrl-C while the command `jaxfit` is still being imported ends it without a traceback."""
+"""Ctrl-C ends the command `jaxfit` without a traceback, also while it is still being imported."""
 
 import os
 import signal
@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 EXIT_CODE = 130
+GRACE = 10.0  # seconds until an interrupted command ends, if need be without putting anything in order
 
 
 def end_at_once(*_: Any) -> None:
@@ -22,10 +23,22 @@ def is_command() -> bool:
     return as_module or os.path.splitext(name)[0] in ("jaxfit", "jaxfit-script")
 
 
+def interrupt(*_: Any) -> None:
+    """Raise KeyboardInterrupt, and see to it that the process ends.
+
+    What is raised within a callback of Python's own is ignored there; one of those of the import system holds
+    a lock, which nobody gives back then.
+    """
+    last = threading.Timer(GRACE, os._exit, [EXIT_CODE])
+    last.daemon = True
+    last.start()
+    raise KeyboardInterrupt
+
+
 def restore_ctrl_c() -> None:
-    """Have Ctrl-C raise KeyboardInterrupt as usual, once there is someone to catch it."""
+    """Have Ctrl-C raise KeyboardInterrupt, once there is someone to catch it."""
     if signal.getsignal(signal.SIGINT) is end_at_once:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, interrupt)
 
 
 if (

@@ -445,6 +445,28 @@ def test_bad_usage_is_noticed_before_the_fit(folder, monkeypatch, capsys, argv, 
     assert captured.err.count("\n") == 1
 
 
+LOST = """
+import os, signal, time
+from jaxfit import _interrupt
+_interrupt.GRACE = 0.1
+signal.signal(signal.SIGINT, _interrupt.end_at_once)
+_interrupt.restore_ctrl_c()
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(1.0)
+except KeyboardInterrupt:
+    time.sleep(60.0)
+"""
+
+
+@pytest.mark.skipif(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, reason="no SIGINT here")
+def test_an_interrupt_that_is_lost_ends_the_command():
+    """As Python loses those that come while it runs a callback of a weak reference."""
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run([sys.executable, "-c", LOST], env=environment, timeout=50)
+    assert done.returncode == 130
+
+
 @pytest.mark.skipif(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, reason="no SIGINT here")
 @pytest.mark.parametrize("seconds", [0.0, 0.5, 1.1])
 def test_an_interrupted_command_is_quiet(tmp_path, seconds):

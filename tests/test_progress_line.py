@@ -15,6 +15,7 @@ from helpers import wavy_cloud
 import jaxfit as jf
 from jaxfit import _progress_line
 from jaxfit._approximation import _cloud_fit
+from jaxfit._approximation._room import Room
 from jaxfit._cli_report import progress_bar
 
 
@@ -73,7 +74,7 @@ def test_a_net_chosen_by_some_of_the_points_says_of_how_many(monkeypatch):
     request = {"tol_average": 1e-3, "tol_maximum": None, "max_steps": 0, "weights": None, "start": None}
     request |= {"progress": None, "throw": False, "errors": None, "adjoint": None}
     base = jf.base_surface(jf.Boundary(**SIDES), net=(6, 6))
-    for room in (None, _cloud_fit.Room((6, 6), 0, len(CLOUD)), _cloud_fit.Room((6, 6), 0, 400)):
+    for room in (None, Room((6, 6), 0, len(CLOUD), 64), Room((6, 6), 0, 400, 64)):
         _cloud_fit.fit_cloud(CLOUD, base, jf.OrthogonalDistance(), request, room)
     counts = ["300", "300", "300 of 400"]
     assert said == [f"fitting 6 x 6 control points to {count} points" for count in counts]
