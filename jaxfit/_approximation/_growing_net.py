@@ -24,7 +24,7 @@ MOST_SIZE = 200  # control points along either direction
 # From one net to the next the size grows by a factor or, far from the tolerance, by its square: sizes are
 # those of one ladder, so that clouds that differ little get the same net.
 GROWTH, MOST_FACTORS = 1.2, 2
-BETTER = 0.98  # what the held-out error has to fall to, as a multiple of that with a coarser net
+BETTER = 0.985  # what the held-out error has to fall to, as a multiple of that with a coarser net
 # Where it does not, but the errors of neighbours are so much alike that they are no noise, so many finer nets
 # are tried all the same: waves that a net is too coarse for take several to be found.
 ALIKE, PATIENCE = 0.5, 4
