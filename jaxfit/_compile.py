@@ -13,7 +13,7 @@ from jaxfit._kept_programs import call_kept
 # XLA's newer emitter of fused CPU kernels takes 1.5 to 1.8 times as long to compile a fit as the older one,
 # whose kernels run no slower.
 OLDER_EMITTER = {"xla_cpu_use_fusion_emitters": False}  # other devices ignore it
-# Level 1 of 3 saves another 10 to 15 % of what compiling takes, for kernels that run 2 to 3 % longer.
+# Level 1 of 3 saves another 10 to 15 % of what compiling takes, for kernels that run 2 to 4 % longer.
 LEVEL = {"xla_backend_optimization_level": 1}
 UNKNOWN = "No such compile option"
 

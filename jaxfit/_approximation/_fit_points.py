@@ -193,7 +193,7 @@ def fit_points(
         request = _DEFAULTS | options
         nets = BoundaryNets(boundary, order, np.asarray(cloud))
         growth = NetGrowth(nets.points, nets, default_method(method), request)
-        first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, nets.meshless)
+        first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, lambda: nets.meshless)
         return fit_growing(growth, first)
     net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
     check_net_of_cloud(net, cloud.shape[0])

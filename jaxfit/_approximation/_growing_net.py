@@ -42,7 +42,7 @@ ENOUGH, POINTS_TO_CHOOSE = 20_000, 24
 # All nets up to one of these sizes are fitted to the same points by the same program, with room for the
 # largest: compiling another takes longer than the surplus. Beyond, a net has no more than it needs.
 STAGES = tuple(FIRST_SIZE * GROWTH**k for k in (7, 10, 14))
-ROOM = 4  # has room for a multiple of so many control points, so that clouds of similar shape share programs
+MULTIPLE = 4  # of control points that there is room for: clouds of similar shape share programs
 # A cloud without outliers is fitted on while one of its points is farther from the surface than so many times
 # the tolerance of the average: that may be met before the fit has come to the ends of a scroll.
 FAR = 10.0
@@ -94,7 +94,7 @@ class NetGrowth:
     def fit(self, points: Any, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of `points`, in a program for all nets of the stage and for any number of iterations."""
         largest = zip(base.shape, self.net(self._stage(size)), strict=True)
-        nu, nv = (max(n, -(-most // ROOM) * ROOM) for n, most in largest)
+        nu, nv = (max(n, -(-most // MULTIPLE) * MULTIPLE) for n, most in largest)
         room = Room((nu, nv), self.request["max_steps"], len(self.points), self.chunk)
         fit = fit_cloud(points, base, self.method, request, room)
         self.steps += int(fit.stats["num_steps"])

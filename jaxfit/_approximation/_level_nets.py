@@ -96,14 +96,11 @@ class BoundaryNets(AbstractNets):
         """Smoothed, at parameters that come from neighbours and not from a projection."""
         if points.shape[1] != 3 or net[0] * net[1] > MOST_FRESH:
             return None
-        return base_surface(self.boundary, points, net=net, order=self.order, method=self.meshless())
-
-    def meshless(self) -> MeshlessAt:
-        """The meshless surface of any net, at parameters that are found once."""
-        return self._meshless
+        return base_surface(self.boundary, points, net=net, order=self.order, method=self.meshless)
 
     @cached_property
-    def _meshless(self) -> MeshlessAt:
+    def meshless(self) -> MeshlessAt:
+        """The meshless surface of any net, at parameters that are found once."""
         return meshless_at(Meshless(most_points=MOST_MESHLESS), cloud_of(self.points, self.boundary))
 
     def feet(self, net: tuple[int, int]) -> None:

@@ -47,8 +47,8 @@ def nearest_feet(
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
     then left out. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
-    repeated end knots, `used` says how many are in use along u and v. So
-    many points as `chunk` are projected at a time; by default that depends on how many there are.
+    repeated end knots, `used` says how many are in use along u and v.
+    `chunk` is how many points are projected at a time; by default that depends on how many there are.
     """
     if chunk is None:
         chunk = chunk_size(len(points) if known is None else min(len(points), FEW))
