@@ -13,6 +13,8 @@ from helpers import count_compilations, data, eps, grid_edges, wavy_cloud, wavy_
 from scipy.interpolate import BSpline
 
 import jaxfit as jf
+from jaxfit._approximation._cloud_fit import final_code, tolerances_of
+from jaxfit._fit._reasons import code_of, result_of
 
 POINTS, EDGES = wavy_cloud(500)
 BOUNDARY = jf.Boundary(**EDGES)
@@ -307,6 +309,29 @@ def test_samples_of_the_surface_leave_it_as_it_is():
     assert bool(fit.converged), fit.message
     assert int(fit.stats["num_steps"]) == 0
     assert np.abs(np.asarray(fit.surface.control_points - surface.control_points)).max() < 1e-15
+
+
+def test_smoothing_a_surface_that_meets_the_points_is_no_divergence():
+    surface = wavy_surface(8, 7)
+    points = np.asarray(surface(*np.random.default_rng(5).random((2, 500))))
+    method = jf.StandardApproximation(smoothing=1e-2, parameter_correction=False)
+    fit = jf.approximate(points, surface, method, tol_average=0.0)
+    assert fit.result == jf.RESULTS.stalled
+    assert 1e-5 < float(fit.average_error) < 0.1
+
+
+def test_the_reason_why_a_final_surface_misses_what_was_met():
+    goal = tolerances_of(1e-3, 1e-2, 5)
+    converged = code_of(jf.RESULTS.converged)
+    cases = {
+        (1e-3, 1e-2): jf.RESULTS.converged,
+        (1.1e-3, 1e-2): jf.RESULTS.rounded,
+        (1e-3, 1.1e-2): jf.RESULTS.stalled,
+    }
+    for errors, result in cases.items():
+        assert result_of(final_code(converged, errors, 2e-4, goal)) == result
+    stopped = code_of(jf.RESULTS.max_steps_reached)
+    assert final_code(stopped, (1.0, 1.0), 0.0, goal) == stopped
 
 
 def test_a_tolerance_out_of_reach_ends_as_stalled(base):

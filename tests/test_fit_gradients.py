@@ -233,3 +233,13 @@ def test_a_cloud_with_its_boundary_is_differentiable_in_its_points_and_weights()
         np.testing.assert_allclose(jnp.sum(gradient[place] * direction), difference, rtol=1e-6, atol=1e-9)
     with pytest.raises(TypeError, match="net must be given"):
         jax.grad(lambda x: jf.fit_points(x, boundary).average_error)(np.tile(POINTS, (3, 1)))
+
+
+def test_raw_scans_refuse_to_be_differentiated_before_they_are_meshed(monkeypatch):
+    monkeypatch.setattr("jaxfit._approximation._fit_scan.sheet_of", None)
+    with pytest.raises(TypeError, match="boundary must be given where"):
+        jax.grad(lambda weights: jf.fit_points(POINTS, weights=weights).average_error)(WEIGHTS)
+    with pytest.raises(TypeError, match="boundary must be given where"):
+        jax.grad(lambda x: jf.fit_points(POINTS, method=jf.OrthogonalDistance(x)).average_error)(1e-3)
+    with pytest.raises(TypeError, match="boundary must be given where"):
+        jf.fit_points(POINTS, adjoint=jf.ImplicitAdjoint())

@@ -6,7 +6,8 @@ from helpers import count_compilations, diagonal
 
 import jaxfit as jf
 from jaxfit._approximation._errors_of_neighbours import errors_of_neighbours
-from jaxfit._approximation._level_nets import BoundaryNets
+from jaxfit._approximation._growing_net import GROWTH, NetGrowth, far_from
+from jaxfit._approximation._level_nets import FIRST_SIZE, BoundaryNets
 from jaxfit._base import carried_base, net_of_sides
 
 COUNT = 3_000
@@ -178,6 +179,31 @@ def test_few_points_and_other_wishes_keep_one_net():
     assert jf.fit_points(CLEAN, BOUNDARY, method=inserting, max_steps=2).surface.shape == (20, 19)
     start = tuple(np.full(COUNT, 0.5) for _ in "uv")
     assert jf.fit_points(CLEAN, BOUNDARY, start=start, max_steps=1).surface.shape == (20, 19)
+
+
+def test_no_net_has_more_than_a_control_point_for_two_points():
+    """Waves of the sides ask for more along one direction, whatever the size."""
+    along = np.linspace(0, 1, 400)
+    still = np.zeros_like(along)
+    side = np.stack([along, still, 0.02 * np.sin(24 * np.pi * along)], axis=1)
+    across = np.stack([still, along, still], axis=1)
+    far = np.eye(3)
+    boundary = jf.Boundary(v0=side, v1=side + far[1], u0=across, u1=across + far[0])
+    points = np.random.default_rng(0).normal(size=(700, 3))
+    request = {"weights": None, "tol_average": 1e-3, "tol_maximum": None}
+    growth = NetGrowth(points, BoundaryNets(boundary, (4, 4), points), None, request)
+    sizes = [FIRST_SIZE * GROWTH**k for k in range(6)]
+    allowed = [size for size in sizes if growth.allows(size)]
+    assert 1 < len(allowed) < 4
+    assert allowed == sizes[: len(allowed)]
+    assert all(2 * np.prod(growth.net(size)) <= 700 for size in allowed)
+    assert growth.net(sizes[0])[0] > 30
+
+
+def test_a_tolerance_of_much_of_the_cloud_is_one():
+    """The maximum that goes with it is no more than the whole."""
+    assert far_from(0.2) == 1.0
+    assert far_from(1e-3) == pytest.approx(1e-2)
 
 
 @pytest.mark.slow

@@ -95,6 +95,27 @@ def test_it_runs_the_whole_way_from_a_cloud(fit):
     assert bool(whole.converged)
 
 
+@pytest.mark.slow
+def test_reports_of_progress_change_nothing(base, monkeypatch):
+    """What a method would end with is not what it goes on with."""
+
+    def halfway(self, problem, old, new):
+        net = 0.5 * (old.surface.control_points + new.surface.control_points)
+        return jf.Iterate(new.surface.moved_to(net), new.projection, new.state, new.step)
+
+    def shifted(self, problem, iterate, stopped_early):
+        surface = iterate.surface.moved_to(iterate.surface.control_points + 0.5)
+        return jf.Iterate(surface, iterate.projection, iterate.state, iterate.step), {}
+
+    monkeypatch.setattr(HeavyBall, "accept", halfway)
+    monkeypatch.setattr(HeavyBall, "postprocess", shifted)
+    method, options = HeavyBall(stall_window=41), dict(tol_average=0.0, max_steps=9)
+    quiet, reported = (
+        jf.approximate(POINTS, base, method, **options, progress=x) for x in (None, lambda *_: None)
+    )
+    np.testing.assert_array_equal(quiet.surface.control_points, reported.surface.control_points)
+
+
 def test_it_runs_in_jit_and_vmap(base, fit):
     def net(points):
         return jf.approximate(points, base, HeavyBall(), **OPTIONS).surface.control_points

@@ -273,8 +273,8 @@ def _fit(
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)
     relative = distance / unit.diagonal
-    if concrete:
-        relative = relative + unit.loss(np.asarray(surface.control_points))
+    loss = unit.loss(np.asarray(surface.control_points)) if concrete else 0.0
+    relative = relative + loss
     counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
     average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
     maximum = xp.max(xp.where(counted, relative, 0.0))
@@ -290,17 +290,24 @@ def _fit(
         maximum_error=arrays[4],
         history=public_history(loop.history, loop.current.step, fairing),
         result=result_of(
-            code_with_rounding(loop.code, average, maximum, problem.tolerances) if concrete else loop.code
+            final_code(loop.code, (average, maximum), loss, problem.tolerances) if concrete else loop.code
         ),
         stats=stats,
     )
 
 
-def code_with_rounding(code: Any, average: Any, maximum: Any, goal: Tolerances) -> Any:
-    """`code`, or that of a fit whose tolerances the rounding of its control points has cost."""
-    met = np.asarray(average) <= goal.average and np.asarray(maximum) <= goal.maximum
-    lost = int(code) == code_of(RESULTS.converged) and not met
-    return np.int32(code_of(RESULTS.rounded)) if lost else code
+def final_code(code: Any, errors: tuple[Any, Any], loss: Any, goal: Tolerances) -> Any:
+    """`code`, unless the final surface misses tolerances that were met in the loop: by no more than the
+    `loss` to rounding, or because it has been polished.
+    """
+
+    def met(slack: Any) -> bool:
+        limits = goal.average, goal.maximum
+        return all(float(error) - slack <= limit for error, limit in zip(errors, limits, strict=True))
+
+    if int(code) != code_of(RESULTS.converged) or met(0.0):
+        return code
+    return np.int32(code_of(RESULTS.rounded if met(float(loss)) else RESULTS.stalled))
 
 
 def _sum(x: Any) -> Any:

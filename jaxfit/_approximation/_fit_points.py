@@ -238,10 +238,10 @@ def _without_boundary(
     base: Any,
     options: dict[str, Any],
 ) -> Fit:
-    if options.get("adjoint") is not None:
+    if options.get("adjoint") is not None or not is_concrete(method, options):
         raise TypeError(
-            "adjoint must be None where no boundary is given, for the sheet depends on the points by jumps; "
-            "leave it out, or pass a boundary and a net."
+            "boundary must be given where a fit is differentiated or traced, since the sheet of a raw scan "
+            "depends on the points by jumps; pass a boundary and a net."
         )
     scan = checked_scan(points, faces, hole_length, base, options.get("start"))
     finite = np.isfinite(scan.points).all(axis=1)

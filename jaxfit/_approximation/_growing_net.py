@@ -1,6 +1,7 @@
 """Fits of clouds whose net grows until the tolerances are met, or until finer nets follow only noise."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -77,7 +78,7 @@ class NetGrowth:
         # Sorted, so that every n-th of them is an even choice, whatever order the points came in.
         self.sorted = counted[np.lexsort(points[counted].T)]
         average, maximum = request["tol_average"], request["tol_maximum"]
-        self.far = np.inf if average is None or maximum is not None else FAR * float(average)
+        self.far = np.inf if average is None or maximum is not None else far_from(average)
         self.most = float(np.sqrt(len(counted) / nets.points_a_control_point))
         self.chunk = chunk_size(min(len(counted), ENOUGH))
         self.steps = 0  # iterations so far, of all nets
@@ -85,6 +86,10 @@ class NetGrowth:
     def net(self, size: float) -> tuple[int, int]:
         """Control points along u and v."""
         return self.nets.net(size, MOST_SIZE)
+
+    def allows(self, size: float) -> bool:
+        """Whether there are points enough for a net of this size."""
+        return size <= self.most and math.prod(self.net(size)) <= self.most**2
 
     def _stage(self, size: float) -> float:
         """The largest size of a net that shares points and program with one of this size."""
@@ -126,7 +131,7 @@ class NetGrowth:
             else:
                 waited += 1
             coarser, size = size, size * self._growth(level)
-            if size > self.most or self.net(size) == self.net(coarser):
+            if not self.allows(size) or self.net(size) == self.net(coarser):
                 return best, RESULTS.net_exhausted if met is None else RESULTS.converged
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
 
@@ -213,6 +218,11 @@ def without_first_smoothing(method: Any) -> Any:
     return dataclasses.replace(method, smoothing=dataclasses.replace(smoothing, first=smoothing.least))
 
 
+def far_from(average: Any) -> float:
+    """The maximum that goes with a tolerance for the average."""
+    return min(FAR * float(average), 1.0)
+
+
 def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
     """The fit to a cleaned cloud. Without a tolerance for the maximum it goes on until that is FAR times the
     one for the average, if it comes to that; the average alone decides whether it has converged.
@@ -220,7 +230,7 @@ def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]
     average, throw = request["tol_average"], request["throw"]
     if average is None or request["tol_maximum"] is not None:
         return fit(request)
-    found = fit(request | {"tol_maximum": FAR * average, "throw": False})
+    found = fit(request | {"tol_maximum": far_from(average), "throw": False})
     found = dataclasses.replace(found, stats=found.stats | {"tol_maximum": np.inf})  # as it was asked for
     ended = found.result in (RESULTS.stalled, RESULTS.max_steps_reached)
     if ended and float(found.average_error) <= average:
@@ -238,9 +248,11 @@ def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
     fit = growth.whole(size, level.fit.surface, request)
     for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
         size *= GROWTH
-        if bool(fit.converged) or size > growth.most:
+        if bool(fit.converged) or not growth.allows(size):
             break
         net = growth.net(size)
+        if net == fit.surface.shape:
+            break
         request["start"] = growth.nets.feet(net)
         fit = growth.whole(size, growth.nets.carried(fit.surface, net), request)
     if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:

@@ -18,7 +18,7 @@ from jax.sharding import PartitionSpec as P
 from jaxfit._approximation._checked_arguments import check_options, checked_start
 from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
-    code_with_rounding,
+    final_code,
     fitted_surface,
     order_by_cell,
     stats_of,
@@ -90,7 +90,7 @@ def fit_sharded_cloud(
         average_error=jax.device_put(average),
         maximum_error=jax.device_put(maximum),
         history=public_history(end.history, end.step, getattr(method, "fairing", None)),
-        result=result_of(code_with_rounding(end.code, average, maximum, tolerances)),
+        result=result_of(final_code(end.code, (average, maximum), rounding, tolerances)),
         stats=stats_of(method, tolerances, end.step, unit, unconverged) | end.stats,
     )
     return converged_or_raise(fit) if request["throw"] else fit

@@ -30,7 +30,9 @@ from jaxfit._varying import as_varying, as_varying_as
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
 BLOCK = 16  # iterations of an unrolled fit that are kept at a time
-MAX_GROWTH = 1e3  # average errors beyond this many times the first one count as divergence
+# Average errors beyond so many times the first one count as divergence; a first one below LEAST_FIRST says
+# nothing, for a surface that meets the points may well be smoothed.
+MAX_GROWTH, LEAST_FIRST = 1e3, 1e-3
 
 Progress = Callable[[int, int, float, float], None]
 
@@ -124,6 +126,8 @@ def iterate(
         loop = _as_often(most, unfinished, step, loop)
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
     last, stats = method.postprocess(problem, loop.current, early)
+    if last is not loop.current:  # what goes on is not what it would end with
+        last = lax.cond(loop.code == running, lambda: loop.current, lambda: last)
     return eqx.tree_at(lambda x: x.current, loop, last), stats
 
 
@@ -205,8 +209,9 @@ def _decide(
     finite = jnp.isfinite(average + maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
     met = (average <= goal.average) & (maximum <= goal.maximum)
     stalled = history.is_stalled(step, method.stall_window, method.stall_gain, method.stall_since)
+    most = MAX_GROWTH * lax.max(history.first, np.asarray(LEAST_FIRST, average.dtype))
     outcomes = (
-        (~finite | (average > MAX_GROWTH * history.first), RESULTS.diverged),
+        (~finite | (average > most), RESULTS.diverged),
         (met, RESULTS.converged),
         (stalled, RESULTS.stalled),
         (step >= goal.max_steps, RESULTS.max_steps_reached),

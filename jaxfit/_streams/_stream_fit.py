@@ -11,7 +11,7 @@ import numpy as np
 from jaxfit._approximation._checked_arguments import check_options, checked_start, checked_weights
 from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
-    code_with_rounding,
+    final_code,
     fitted_surface,
     stats_of,
     tolerances_of,
@@ -59,7 +59,8 @@ def fit_stream(
     lost = int(loop.code) == code_of(RESULTS.diverged)  # the stored feet are those of a surface given up
     errors = GlobalFeet() if request["errors"] is None else request["errors"]
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
-    code = code_with_rounding(loop.code, average, maximum, passes.tolerances)
+    loss = unit.loss(np.asarray(surface.control_points))
+    code = final_code(loop.code, (average, maximum), loss, passes.tolerances)
     loop = eqx.tree_at(lambda x: x.code, loop, code)
     known = stats_of(method, passes.tolerances, loop.current.step, unit, unconverged)
     stats = known | {"passes": passes.made + 1} | stats  # with the first, which finds the unit
