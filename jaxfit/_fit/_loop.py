@@ -30,9 +30,9 @@ from jaxfit._varying import as_varying, as_varying_as
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
 BLOCK = 16  # iterations of an unrolled fit that are kept at a time
-# Average errors beyond so many times the first one count as divergence; a first one below LEAST_FIRST says
-# nothing, for a surface that meets the points may well be smoothed.
-MAX_GROWTH, LEAST_FIRST = 1e3, 1e-3
+# Average errors beyond so many times the first one count as divergence, where they also exceed the diagonal:
+# a surface that meets the points from the start may well be smoothed.
+MAX_GROWTH = 1e3
 
 Progress = Callable[[int, int, float, float], None]
 
@@ -206,12 +206,12 @@ def _decide(
     """Whether the loop ends on a surface that has just been measured, as the code of one of RESULTS."""
     step, goal = iterate.step, problem.tolerances
     average, maximum = history.at(step)[0], history.at(step)[1]
-    finite = jnp.isfinite(average + maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
+    finite = jnp.isfinite(maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
+    sound = finite & (average <= 1.0 + MAX_GROWTH * history.first)
     met = (average <= goal.average) & (maximum <= goal.maximum)
     stalled = history.is_stalled(step, method.stall_window, method.stall_gain, method.stall_since)
-    most = MAX_GROWTH * lax.max(history.first, np.asarray(LEAST_FIRST, average.dtype))
     outcomes = (
-        (~finite | (average > most), RESULTS.diverged),
+        (~sound, RESULTS.diverged),
         (met, RESULTS.converged),
         (stalled, RESULTS.stalled),
         (step >= goal.max_steps, RESULTS.max_steps_reached),
