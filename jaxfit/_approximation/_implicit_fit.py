@@ -110,7 +110,7 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return jax.jvp(partial(_implicit, rest, at_rest, end), (inputs,), tangents[2:])
+    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), tangents[2:])
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
@@ -141,7 +141,7 @@ def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: 
     at_rest = _at_rest(rest, adjoint, end, inputs)
     if not is_concrete(inputs):
         _check_at_rest(adjoint, at_rest.stationarity)
-    return _implicit(rest, at_rest, end, inputs)
+    return _fitted_at_rest(rest, at_rest, end, inputs)
 
 
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
@@ -164,31 +164,60 @@ def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: Fit
     return whole(goal, most, end, inputs)
 
 
-@partial(compiled, kept=True, static_argnums=0)
-def _implicit(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit as a function of the inputs."""
+    return _implicit(rest, at_rest, end, inputs, None)[0]
+
+
+@_fitted_at_rest.defjvp
+def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
+    at_rest, end, inputs = primals
+    return _implicit(rest, at_rest, end, jax.tree.map(only_once, inputs), tangents[2])
+
+
+@jax.custom_jvp
+def only_once(x: Any) -> Any:
+    """`x`, in a derivative that has none itself."""
+    return x
+
+
+@only_once.defjvp
+def _refuse(primals: Any, tangents: Any) -> Any:
+    raise TypeError(
+        "a fit has no second derivative by ImplicitAdjoint(), which is exact to first order only; take "
+        "differences of gradients."
+    )
+
+
+@partial(compiled, kept=True, static_argnums=0)
+def _implicit(
+    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs, change: FitInputs | None
+) -> tuple[Fitted, Fitted | None]:
+    """The polished fit, and its derivative along a `change` of the inputs."""
     at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
     here = at_rest.projection
     surface = end.surface.moved_to(at_rest.net)
-    # The system of the last step of polishing was made at a surface so near that it serves here, too.
+    # That of the last step of polishing, or of one so near that it serves here, too.
     system = at_rest.system
 
-    def residual(net: Array) -> StationarityResidual:
+    def at(net: Array, inputs: FitInputs) -> tuple[Array, Fitted]:
         method = eqx.combine(inputs.numbers, rest)
         problem, still = problem_of(end, inputs), base_net_of(end, inputs)
         u, v = (here.u, here.v) if method.finds_feet else given_feet_of(end, inputs)
         feet = feet_in_rows(surface, end.problem, u, v)
         args = (method, end.state, end.surface.moved_to(net), problem, feet)
-        return stationarity_residual(*args, system.free, still)
+        found = stationarity_residual(*args, system.free, still)
+        return found.value, _outward(end, inputs, at_rest, net, found)
 
+    if change is None:
+        return at(at_rest.net, inputs)[1], None
+    (_, fitted), along_inputs = jax.linearize(partial(at, at_rest.net), inputs)
+    _, along_net = jax.linearize(lambda net: at(net, inputs), at_rest.net)
+    right, held = along_inputs(change)
     accuracy = float(jnp.finfo(at_rest.net.dtype).eps) ** ACCURACY
-    net = lax.custom_root(
-        lambda net: residual(net).value,
-        at_rest.net,
-        solve=lambda _, net: net,
-        tangent_solve=lambda apply, right: system.solved_differentiably(apply, right, accuracy),
-    )
-    return _outward(end, inputs, at_rest, net, residual(net))
+    move = system.solved_differentiably(lambda x: along_net(x)[0], -right, accuracy)
+    return fitted, jax.tree.map(jnp.add, held, along_net(move)[1])
 
 
 def _outward(

@@ -39,14 +39,18 @@ class NewtonSystem(eqx.Module):
 
     def solved(
         self, apply: Operator, right: Array, shift: Any, rtol: Any, most_cycles: int
-    ) -> Float[Array, "nu nv d"]:
-        """x with (A + shift fixed) x = right, for A or its transpose."""
+    ) -> tuple[Float[Array, "nu nv d"], Float[Array, "nu nv d"]]:
+        """x with (A + shift fixed) x = right, for A or its transpose, and A x."""
         free = self.free[:, :, None]
 
-        def shifted(x: Array) -> Array:
-            return apply(x) + jnp.where(free, shift * self.fixed(jnp.where(free, x, 0.0)), 0.0)
+        def shifts(x: Array) -> Array:
+            return jnp.where(free, shift * self.fixed(jnp.where(free, x, 0.0)), 0.0)
 
-        return gmres(shifted, self.preconditioner, right, RESTART, rtol, most_cycles).net
+        def shifted(x: Array) -> Array:
+            return apply(x) + shifts(x)
+
+        found = gmres(shifted, self.preconditioner, right, RESTART, rtol, most_cycles)
+        return found.net, found.image - shifts(found.net)
 
     def solved_differentiably(self, apply: Operator, right: Array, rtol: float) -> Float[Array, "nu nv d"]:
         """x with A x = right, linear in `right` for forward and reverse mode; NaN where it was not found."""

@@ -34,7 +34,7 @@ GROWTH = 4.0  # of |G| in an accepted step
 
 
 class PolishedFit(eqx.Module):
-    """The surface at rest, its feet, |G| over the norms of its terms, and the system of the last step."""
+    """The surface at rest, its feet, |G| over the norms of its terms, and the linear system there."""
 
     net: Float[Array, "nu nv d"]
     projection: Projection
@@ -55,12 +55,13 @@ class _State(eqx.Module):
     """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
 
     accepted: _Accepted
+    system: NewtonSystem  # at the accepted net
     trial: Float[Array, "nu nv d"]
-    system: NewtonSystem  # that `trial` comes from
     predicted: Float[Array, ""]
     shift: Float[Array, ""]
     steps: Int[Array, ""]
     again: Bool[Array, ""]
+    begun: Bool[Array, ""]
     done: Bool[Array, ""]
 
 
@@ -81,13 +82,16 @@ def polished(
     """
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
-    feet = projection.u, projection.v
-    first_system = newton_system(method, state, surface, problem, feet, projection.error)
-    free = first_system.free
+
+    def system_at(there: WorkingSurface, here: Projection, shift: Array) -> NewtonSystem:
+        return newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
 
     def advance(now: _State) -> _State:
         old, there = now.accepted, surface.moved_to(now.trial)
         here = _measured(method, problem, there, old.projection)
+        system = system_at(there, here, now.shift)
+        free = jnp.where(now.begun, now.system.free, system.free)  # the same for all steps
+        system = eqx.tree_at(lambda s: s.free, system, free)
         feet = feet_in_rows(there, problem, here.u, here.v)
 
         def residual(net: Array) -> tuple[Array, Any]:
@@ -101,24 +105,24 @@ def polished(
         good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
         shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
 
-        def step() -> tuple[Array, NewtonSystem, Array]:
-            system = newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
+        def step() -> tuple[Array, Array]:
             wanted = jnp.clip(LAST_ACCURACY * least / new.size, ACCURACY, LAST_ACCURACY)
-            solution = system.solved(apply, -value, shift, wanted, MOST_CYCLES)
-            move = _shortened(surface.moved_to(now.trial), solution)
-            return now.trial + move, system, jnp.sum(move * (value + 0.5 * apply(move)))
+            solution, image = system.solved(apply, -value, shift, wanted, MOST_CYCLES)
+            share = _share_within_reach(surface.moved_to(now.trial), solution)
+            move = share * solution
+            return now.trial + move, jnp.sum(move * (value + 0.5 * share * image))
 
         done = good & ((new.size <= least) | (now.steps >= most))
-        none = (old.net, now.system, jnp.zeros_like(work))
-        trial, system, predicted = lax.cond(good & ~done, step, lambda: none)
-        accepted = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
+        trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
+        kept = jax.tree.map(lambda x, y: jnp.where(good, x, y), (new, system), (old, now.system))
         ended = done | (shift > MOST_SHIFT)
-        return _State(accepted, trial, system, predicted, shift, now.steps + good, ~good, ended)
+        return _State(*kept, trial, predicted, shift, now.steps + good, ~good, yes, ended)
 
-    nothing = jnp.zeros((), still.dtype)
+    nothing, yes = jnp.zeros((), still.dtype), jnp.asarray(True)
     first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
-    yes = jnp.asarray(True)
-    begin = _State(first, still, first_system, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes)
+    unknown = jax.eval_shape(system_at, surface, projection, nothing)
+    system = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
+    begin = _State(first, system, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes, ~yes)
     last = lax.while_loop(lambda now: ~now.done, advance, begin)
     end = last.accepted
     share = end.size / jnp.where(end.terms > 0, end.terms, 1.0)
@@ -136,13 +140,11 @@ def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:
     return jnp.where(now.again, now.shift, jnp.where(good, fallen, taken_back))
 
 
-def _shortened(surface: WorkingSurface, move: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
-    """The move, shorter where a control point would come too near to its neighbours."""
-    length, longest = (
-        jnp.sqrt(jnp.sum(move**2, axis=-1)),
-        longest_moves(surface.control_points, REACH, surface.used),
-    )
-    return move * jnp.min(jnp.where(length > longest, longest / jnp.where(length > 0, length, 1.0), 1.0))
+def _share_within_reach(surface: WorkingSurface, move: Float[Array, "nu nv d"]) -> Float[Array, ""]:
+    """The share of the move with which no control point comes too near to its neighbours."""
+    length = jnp.sqrt(jnp.sum(move**2, axis=-1))
+    longest = longest_moves(surface.control_points, REACH, surface.used)
+    return jnp.min(jnp.where(length > longest, longest / jnp.where(length > 0, length, 1.0), 1.0))
 
 
 def _measured(

@@ -52,7 +52,7 @@ def gmres_solve(
 
     def cycle(state: State) -> State:
         x, residual, step, history, _ = state
-        moved = x + gmres_cycle(apply, precondition, residual, restart)
+        moved = x + gmres_cycle(apply, precondition, precondition(residual), restart)
         rest = right - apply(moved)
         before, after = history.at(step)[1], jnp.max(distances(rest, limits.diagonal))
         better = after < before

@@ -13,11 +13,26 @@ SLOW = 0.9  # a cycle that leaves more of the residual than this is the last
 
 
 class GmresSolution(NamedTuple):
-    """An approximate solution, the share of the residual that is `left`, and the cycles it took."""
+    """An approximate solution and its `image` under the matrix, the share of the residual that is `left`, and
+    the cycles it took.
+    """
 
     net: Float[Array, "n m d"]
+    image: Float[Array, "n m d"]
     left: Float[Array, ""]
     cycles: Int[Array, ""]
+
+
+class _Cycles(NamedTuple):
+    """The best net so far, and the one that the last cycle proposes."""
+
+    best: Array
+    image: Array
+    left: Array
+    proposed: Array
+    first: Array  # the size of the right-hand side
+    cycles: Array
+    ended: Array
 
 
 def gmres(
@@ -34,50 +49,50 @@ def gmres(
     cycle takes less than a tenth of it away. A cycle that makes it greater is not accepted.
     """
 
-    def size(x: Array) -> Array:
-        return jnp.sqrt(jnp.sum(precondition(x) ** 2))
+    def cycle(now: _Cycles) -> _Cycles:
+        image = apply(now.proposed)
+        residual = precondition(right - image)
+        size = jnp.linalg.norm(residual.reshape(-1))
+        best, image, left = (
+            jnp.where(size < now.left, new, old)
+            for new, old in ((now.proposed, now.best), (image, now.image), (size, now.left))
+        )
+        first = jnp.where(now.cycles == 0, size, now.first)
+        goal = rtol * first
+        ended = (left <= goal) | (now.cycles == most_cycles) | ~(size < SLOW * now.left)
+        proposed = lax.cond(
+            ended, lambda: best, lambda: best + gmres_cycle(apply, precondition, residual, restart, goal)
+        )
+        return _Cycles(best, image, left, proposed, first, now.cycles + ~ended, ended)
 
-    State = tuple[Array, Array, Array, Array, Array]
-
-    def unfinished(state: State) -> Array:
-        _, _, left, cycles, slow = state
-        return ~slow & (left > goal) & (cycles < most_cycles)
-
-    def cycle(state: State) -> State:
-        x, residual, before, cycles, _ = state
-        moved = x + gmres_cycle(apply, precondition, residual, restart, goal)
-        rest = right - apply(moved)
-        after = size(rest)
-        better = after < before
-        x, residual = (jnp.where(better, new, old) for new, old in ((moved, x), (rest, residual)))
-        return x, residual, jnp.where(better, after, before), cycles + 1, ~(after < SLOW * before)
-
-    first = size(right)
-    goal = rtol * first
-    begin = (jnp.zeros_like(right), right, first, jnp.asarray(0, jnp.int32), jnp.asarray(False))
-    x, _, left, cycles, _ = lax.while_loop(unfinished, cycle, begin)
-    return GmresSolution(x, left / jnp.where(first > 0, first, 1.0), cycles)
+    nothing, zero = jnp.zeros_like(right), jnp.zeros((), right.dtype)
+    start = jnp.asarray(0, jnp.int32), jnp.asarray(False)
+    begin = _Cycles(nothing, nothing, zero + jnp.inf, nothing, zero, *start)
+    end = lax.while_loop(lambda now: ~now.ended, cycle, begin)
+    left = end.left / jnp.where(end.first > 0, end.first, 1.0)
+    return GmresSolution(end.best, end.image, left, end.cycles)
 
 
 def gmres_cycle(
-    apply: Operator, precondition: Operator, right: Array, restart: int, goal: Any = 0.0
+    apply: Operator, precondition: Operator, residual: Array, restart: int, goal: Any = 0.0
 ) -> Array:
-    """One cycle from zero: the x of the Krylov space for which M (right - A x) is smallest, or `goal`.
+    """One cycle from zero: the x of the Krylov space for which |residual - M A x| is smallest, or `goal`; the
+    residual is a preconditioned one.
 
     Twice classical Gram-Schmidt. An exhausted space adds zero vectors, which the least-squares problem leaves
     alone. Rotations of its rows say how much of the residual is left.
     """
-    first = precondition(right).reshape(-1)
+    first = residual.reshape(-1)
     size = jnp.linalg.norm(first)
-    info = jnp.finfo(right.dtype)
+    info = jnp.finfo(first.dtype)
     basis = (
-        jnp.zeros((restart + 1, first.shape[0]), right.dtype).at[0].set(first / jnp.maximum(size, info.tiny))
+        jnp.zeros((restart + 1, first.shape[0]), first.dtype).at[0].set(first / jnp.maximum(size, info.tiny))
     )
-    projected = jnp.zeros((restart + 1, restart), right.dtype)
+    projected = jnp.zeros((restart + 1, restart), first.dtype)
 
     def extend(state: Any) -> Any:
         k, basis, projected, rotations, _ = state
-        new = precondition(apply(basis[k].reshape(right.shape))).reshape(-1)
+        new = precondition(apply(basis[k].reshape(residual.shape))).reshape(-1)
         scale = jnp.linalg.norm(new)
         once = basis @ new
         new = new - once @ basis
@@ -99,8 +114,8 @@ def gmres_cycle(
     def unfinished(state: Any) -> Array:
         return (state[0] < restart) & (state[4] > goal)
 
-    begin = (jnp.asarray(0, jnp.int32), basis, projected, jnp.eye(restart + 1, dtype=right.dtype), size)
+    begin = (jnp.asarray(0, jnp.int32), basis, projected, jnp.eye(restart + 1, dtype=first.dtype), size)
     _, basis, projected, _, _ = lax.while_loop(unfinished, extend, begin)
-    target = jnp.zeros(restart + 1, right.dtype).at[0].set(size)
+    target = jnp.zeros(restart + 1, first.dtype).at[0].set(size)
     weights = jnp.linalg.lstsq(projected, target)[0]
-    return (weights @ basis[:-1]).reshape(right.shape)
+    return (weights @ basis[:-1]).reshape(residual.shape)
