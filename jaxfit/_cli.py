@@ -13,7 +13,7 @@ from pathlib import Path
 
 from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
-from jaxfit._cli_fit import FitOfFile, fitted_surface, read
+from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
 from jaxfit._cli_page import write_page
 from jaxfit._cli_report import as_sentence, print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
@@ -107,9 +107,8 @@ def _load_matplotlib() -> None:
 def _check_files(args: argparse.Namespace) -> str | None:
     """Refuse now what cannot be written later; return the picture's path, if there is to be one."""
     io.check_output(args.output)
-    for name in filter(None, (args.input, args.boundary)):
-        if os.path.exists(name) and os.path.realpath(name) == os.path.realpath(args.output):
-            raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
+    if read_and_written([vars(args)], [args.output]):
+        raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
     drawable = importlib.util.find_spec("matplotlib") is not None
     if args.report:
         io.check_output(args.report, (".html", ".htm"))

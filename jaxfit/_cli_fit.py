@@ -4,7 +4,9 @@ import argparse
 import dataclasses
 import inspect
 import math
+import os
 import time
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jaxfit
@@ -48,6 +50,15 @@ def read(args: argparse.Namespace) -> io.PointData:
     if as_cloud and is_nodata(data.cloud).any():  # what is left is a scan
         return dataclasses.replace(data, points=data.cloud, grid=None, boundary=None)
     return data
+
+
+def read_and_written(arguments: Iterable[Mapping[str, Any]], written: Iterable[str]) -> str | None:
+    """The first of the files `written` that is also one that fits with these `arguments` read, if any is;
+    links are followed.
+    """
+    named = {x[name] for x in arguments for name in ("input", "boundary", "normals")} - {None}
+    kept = {os.path.realpath(name) for name in named if os.path.exists(name)}
+    return next((name for name in written if os.path.realpath(name) in kept), None)
 
 
 def fitted_surface(fit: Any) -> Any:

@@ -132,7 +132,10 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
     ("argv", "said"),
     [
         (["a.npz", "other/a.npz"], "would both write a.npz"),
-        (["a.npz", "-o", "."], "holds the file"),
+        (["a.npz", "-o", "."], "holds the file a.npz"),
+        (["a.npz", "-o", "other"], "holds the file a.npz"),  # a link to it
+        (["grid.npz", "--normals", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
+        (["grid.npz", "--boundary", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
         (["a.npz", "-o", "a.npz"], "cannot be made"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
@@ -142,6 +145,9 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
 )
 def test_bad_usage_is_one_sentence(folder, capsys, monkeypatch, argv, said):
     monkeypatch.setitem(sys.modules, "distributed", None)
+    os.mkdir("other")
+    os.symlink(folder / "a.npz", "other/a.npz")
+    os.link("b.npz", "other/grid.npz")
     output = [] if "-o" in argv else ["-o", "out"]
     assert _cli.main(["batch", *argv, *output]) == 2
     captured = capsys.readouterr()

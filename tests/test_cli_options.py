@@ -294,6 +294,7 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "cloud.npz", "-o", "none/s.npz"], "does not exist; make it first"),
         (["fit", "cloud.npz", "-o", "cloud.npz"], "is the file that is read"),
         (["fit", "cloud.npz", "-o", "./border.npz", "--boundary", "border.npz"], "is read"),
+        (["fit", "grid.npz", "-o", "./border.npz", "--normals", "border.npz"], "is read"),
         (["fit", "cloud.npz", "-o", "s.npz", "--picture", "s.dwg"], "suffix .dwg"),
         (["fit", "cloud.npz", "-o", "s.npz", "--net", "5"], "'5' is no pair of counts"),
         (["fit", "cloud.npz", "-o", "s.npz", "--tol-average", "-1"], "'-1' is no percentage"),
