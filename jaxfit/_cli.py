@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (default: that of the process) and return its exit code.
 
     Switches JAX to double precision unless told ``--float32``, and has it keep compiled programs unless told
-    ``--no-cache``. What goes wrong is one sentence on stderr; the codes are those in ``jaxfit fit --help``.
+    ``--no-cache``. What goes wrong is one sentence on stderr, after a traceback if it is a defect; the codes
+    are those in ``jaxfit fit --help``.
     With the process's own arguments it ends the process.
     """
     code = _run(argv)
@@ -60,6 +62,10 @@ def _run(argv: Sequence[str] | None) -> int:
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
         return _fail(f"the fit failed: {error or type(error).__name__}", FAILED)
+    except Exception as error:  # else Python would end with the code of a tolerance that was missed
+        traceback.print_exc()
+        defect = f"{type(error).__name__}: {error}"
+        return _fail(f"the fit failed; please report this defect with the lines above: {defect}", FAILED)
 
 
 def _fail(sentence: object, code: int) -> int:

@@ -270,6 +270,15 @@ def test_a_numerical_failure_writes_nothing(fits, folder, capsys, how):
     assert captured.err.count("\n") == 1
 
 
+def test_a_defect_is_told_from_a_missed_tolerance(fits, folder, capsys):
+    fits.fails = KeyError("knots")
+    assert run("cloud.npz") == 3
+    *traceback, said = capsys.readouterr().err.splitlines()
+    assert traceback[0].startswith("Traceback")
+    assert said.startswith("jaxfit: error: the fit failed; please report this defect")
+    assert said.endswith("KeyError: 'knots'")
+
+
 def test_interruption_writes_nothing(fits, folder, capsys):
     before = names(folder)
     fits.fails = KeyboardInterrupt()
