@@ -78,10 +78,10 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     trace_quickly()
     picture = _check_files(args)
     set_compile_cache(args)
-    data = read(args)
+    data, chosen = read(args)
     if picture:  # while the fit is compiled, which leaves Python idle
         threading.Thread(target=_load_matplotlib, daemon=True).start()
-    task = FitOfFile(args, data)
+    task = FitOfFile(chosen, data)
     with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
         done = task.run(progress)
     offset = io.write_surface(args.output, fitted_surface(done.fit))
