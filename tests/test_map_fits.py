@@ -1,5 +1,6 @@
 """Many fits in one call: the same fits as one by one, whoever computes them."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 from helpers import wavy_cloud
 
 import jaxfit as jf
+from jaxfit._cores import cores
 
 SIZES = (300, 260, 290)
 CLOUDS = [wavy_cloud(n, seed=n)[0] + [0, 0, 0.01 * i] for i, n in enumerate(SIZES)]
@@ -60,6 +62,16 @@ def test_bases_lambdas_and_weights_may_differ():
     for i, fit in enumerate(fits):
         assert_same(fit, jf.approximate(CLOUDS[0], bases[i], methods[i], weights=weights[i], **OPTIONS))
         assert float(fit.stats["smoothing"]) == lambdas[i]
+
+
+@pytest.mark.parametrize(("granted", "expected"), [("2", 2), ("64", 3), ("0", 3), ("some", 3), (None, 3)])
+def test_threads_are_as_many_as_cores_are_granted(monkeypatch, granted, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 5}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.delenv("NPROC", raising=False)
+    if granted is not None:
+        monkeypatch.setenv("NPROC", granted)
+    assert cores() == expected
 
 
 def test_any_executor_computes():

@@ -14,8 +14,8 @@ from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._batch._broadcast import Request, one_by_one, requests_of
 from jaxfit._batch._failed_fit import failed_fit
-from jaxfit._batch._worker_processes import cores
 from jaxfit._checks import as_points, is_concrete
+from jaxfit._cores import cores
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._precision import bucket, working_dtype
