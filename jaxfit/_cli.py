@@ -7,13 +7,14 @@ import os
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
-from jaxfit._cli_fit import FitOfFile, fitted_surface, read
+from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
 from jaxfit._cli_page import write_page
 from jaxfit._cli_report import as_sentence, print_table, progress_bar
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
@@ -28,7 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (default: that of the process) and return its exit code.
 
     Switches JAX to double precision unless told ``--float32``, and has it keep compiled programs unless told
-    ``--no-cache``. What goes wrong is one sentence on stderr; the codes are those in ``jaxfit fit --help``.
+    ``--no-cache``. What goes wrong is one sentence on stderr, after a traceback if it is a defect; the codes
+    are those in ``jaxfit fit --help``.
     With the process's own arguments it ends the process.
     """
     code = _run(argv)
@@ -60,6 +62,10 @@ def _run(argv: Sequence[str] | None) -> int:
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
         return _fail(f"the fit failed: {error or type(error).__name__}", FAILED)
+    except Exception as error:  # else Python would end with the code of a tolerance that was missed
+        traceback.print_exc()
+        defect = f"{type(error).__name__}: {error}"
+        return _fail(f"the fit failed; please report this defect with the lines above: {defect}", FAILED)
 
 
 def _fail(sentence: object, code: int) -> int:
@@ -72,10 +78,10 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     trace_quickly()
     picture = _check_files(args)
     set_compile_cache(args)
-    data = read(args)
+    data, chosen = read(args)
     if picture:  # while the fit is compiled, which leaves Python idle
         threading.Thread(target=_load_matplotlib, daemon=True).start()
-    task = FitOfFile(args, data)
+    task = FitOfFile(chosen, data)
     with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
         done = task.run(progress)
     offset = io.write_surface(args.output, fitted_surface(done.fit))
@@ -107,9 +113,8 @@ def _load_matplotlib() -> None:
 def _check_files(args: argparse.Namespace) -> str | None:
     """Refuse now what cannot be written later; return the picture's path, if there is to be one."""
     io.check_output(args.output)
-    for name in filter(None, (args.input, args.boundary)):
-        if os.path.exists(name) and os.path.realpath(name) == os.path.realpath(args.output):
-            raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
+    if read_and_written([vars(args)], [args.output]):
+        raise io.InputError(f"the output {args.output} is the file that is read; give it another name.")
     drawable = importlib.util.find_spec("matplotlib") is not None
     if args.report:
         io.check_output(args.report, (".html", ".htm"))

@@ -29,7 +29,7 @@ exit codes:
   0  fitted and written
   1  written, but a tolerance that was given was not reached (a missed default shows in the table only)
   2  bad input or usage, or a file cannot be written
-  3  the fit failed numerically, nothing is written
+  3  the fit failed numerically, nothing is written; or jaxfit has a defect, which a traceback shows
 
 environment:
   JAXFIT_CACHE_DIR  as --cache; empty or "off" is --no-cache

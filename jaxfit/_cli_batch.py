@@ -6,6 +6,7 @@ from pathlib import Path
 
 from jaxfit import io
 from jaxfit._cli_batch_file import Job, failed, fit_file, job_of, size_of
+from jaxfit._cli_fit import read_and_written
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row, Table
 from jaxfit._cli_workers import Schedule, chosen_pool
 
@@ -43,8 +44,10 @@ def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
                 f"{other} and {name} would both write {job.row['surface']}; rename one, or give them folders "
                 "of their own."
             )
-        if job.arguments["output"] in (name, job.arguments["boundary"]):
-            raise io.InputError(f"{folder} holds the file {name} that is read; name another folder.")
+    arguments = [job.arguments for job in jobs.values()]
+    name = read_and_written(arguments, (x["output"] for x in arguments))
+    if name:
+        raise io.InputError(f"{folder} holds the file {Path(name).name} that is read; name another folder.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -90,7 +90,7 @@ def failed(job: Job, sentence: object) -> Row:
 
 
 def _fitted(args: argparse.Namespace) -> Row:
-    data = read(args)
+    data, args = read(args)
     done = FitOfFile(args, data).run()
     fit = done.fit
     io.write_surface(args.output, fitted_surface(fit))

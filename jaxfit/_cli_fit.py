@@ -4,7 +4,9 @@ import argparse
 import dataclasses
 import inspect
 import math
+import os
 import time
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jaxfit
@@ -32,22 +34,33 @@ class FittedFile(NamedTuple):
     tolerances: str
 
 
-def read(args: argparse.Namespace) -> io.PointData:
-    """The points of ``args.input``; of the terrain also its own method and net, in `args`."""
+def read(args: argparse.Namespace) -> tuple[io.PointData, argparse.Namespace]:
+    """The points of ``args.input``, and the arguments; for the terrain with its own method and net."""
     if args.input == TERRAIN:
-        data = io.jacksboro()
-        if args.method == "auto":
-            args.method = "approximate"
-        if not interpolates(args.method) and args.net is None:
-            args.net = _TERRAIN_NET
+        data, args = io.jacksboro(), _of_terrain(args)
     else:
         data = io.read_points(args.input)
         check_magnitude("points", data.cloud)
     data = data if args.grid is None else data.as_grid(*args.grid)
     as_cloud = data.grid is not None and not interpolates(args.method) and not asks_for_grid(args)
     if as_cloud and is_nodata(data.cloud).any():  # what is left is a scan
-        return dataclasses.replace(data, points=data.cloud, grid=None, boundary=None)
-    return data
+        data = dataclasses.replace(data, points=data.cloud, grid=None, boundary=None)
+    return data, args
+
+
+def _of_terrain(args: argparse.Namespace) -> argparse.Namespace:
+    method = "approximate" if args.method == "auto" else args.method
+    net = _TERRAIN_NET if args.net is None and not interpolates(method) else args.net
+    return argparse.Namespace(**vars(args) | {"method": method, "net": net})
+
+
+def read_and_written(arguments: Iterable[Mapping[str, Any]], written: Iterable[str]) -> str | None:
+    """The first of the files `written` that is also one that fits with these `arguments` read, if any is;
+    links are followed.
+    """
+    named = {x[name] for x in arguments for name in ("input", "boundary", "normals")} - {None}
+    kept = {os.path.realpath(name) for name in named if os.path.exists(name)}
+    return next((name for name in written if os.path.realpath(name) in kept), None)
 
 
 def fitted_surface(fit: Any) -> Any:

@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxfit import io
+from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FittedFile
 from jaxfit._cli_methods import OPTIONS
 
-_SETTINGS = "method net order grid boundary tol_average tol_maximum max_steps float32".split()
+_SETTINGS = "method net order grid boundary hole_length tol_average tol_maximum max_steps float32".split()
 
 
 def write_page(
@@ -32,8 +33,9 @@ def write_page(
 
 def _settings(args: argparse.Namespace, done: FittedFile) -> dict[str, str]:
     """The tolerances, and the options that were given, by the names they have on the command line."""
-    given = {name: getattr(args, name) for name in (*_SETTINGS, *OPTIONS)}
-    said = {name: _said(name, value) for name, value in given.items() if value not in (None, False)}
+    defaults = argument_parser().parse_args(["fit", "", "-o", ""])
+    names = [name for name in (*_SETTINGS, *OPTIONS) if getattr(args, name) != getattr(defaults, name)]
+    said = {name: _said(name, getattr(args, name)) for name in names}
     options = {f"--{name.replace('_', '-')}": value for name, value in said.items()}
     return {"tolerances": done.tolerances, **options}
 

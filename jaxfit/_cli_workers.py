@@ -139,7 +139,7 @@ class Schedule:
                     continue
                 self.compiled.add(size)
                 yield result
-            if broken:
+            if broken or not together:  # nothing runs where the pool had ended before it took a job
                 suspects = list(self.running.values())
                 self.running.clear()
                 self.pool.restart()
@@ -155,7 +155,12 @@ class Schedule:
             job, size = self._next()
             if job is None:
                 return
-            self.running[self.pool.submit(function, job)] = job, size
+            try:
+                future = self.pool.submit(function, job)
+            except BrokenExecutor:  # a process has ended since the last look
+                self.suspects.append((job, size))
+                return
+            self.running[future] = job, size
 
     def _next(self) -> tuple[Any, Hashable]:
         self.on_trial = bool(self.suspects)

@@ -26,7 +26,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
     folder
         Where (default: the environment variable ``JAXFIT_CACHE_DIR``, else ``jaxfit`` in the user's cache
         folder, which is ``~/.cache/jaxfit`` on Linux). It is made if need be. Whoever can write it can run
-        code here. ``"off"`` or an empty name keep nothing.
+        code here, so that must be nobody else. ``"off"`` or an empty name keep nothing.
 
     Returns
     -------
@@ -36,7 +36,8 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
     Raises
     ------
     OSError
-        The folder can't be made or written.
+        The folder can't be made or written, or belongs to another user or can be written by others (which is
+        not looked at on Windows).
     RuntimeError
         There is no home folder, and none is named.
 
@@ -57,7 +58,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path | None:
         _kept_programs.folder = None
     else:
         found /= f"{VERSION}{_kept_programs.version_of_code()}"  # so JAX's cache holds nothing that we lack
-        found.mkdir(exist_ok=True)
+        _make_private(found)
         _kept_programs.folder = found
     return found
 
@@ -66,19 +67,34 @@ def cache_folder(asked: str | None = None) -> Path | None:
     """The folder, made and cleared of what has long not been used; None if the variable says "off".
 
     It is the one that is `asked` for, else that of the environment variable, else one in the user's cache
-    folder. Raises OSError if it cannot be written.
+    folder. Raises OSError if it cannot be written, or if others can.
     """
     named = os.environ.get(VARIABLE) if asked is None else asked
     if named is not None and named.strip().lower() in ("", "off"):
         return None
     folder = Path(named).expanduser() if named else _user_cache() / "jaxfit"
-    # JAX runs what it finds there, so nobody else may write it.
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _make_private(folder)
     trial = folder / f".{os.getpid()}"
     trial.touch()
     trial.unlink()
     _remove_oldest(folder)
     return folder.absolute()
+
+
+def _make_private(folder: Path) -> None:
+    """Make it, unless it is there, for this user alone; refuse one that others can write."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    status = folder.stat()
+    # What lies there is run. On Windows neither number says who may write.
+    if not hasattr(os, "getuid"):
+        return
+    advice = None
+    if status.st_uid != os.getuid():
+        advice = "belongs to another user; name another"
+    elif status.st_mode & 0o022:
+        advice = f"can be written by others; name another, or chmod go-w {folder}"
+    if advice:
+        raise PermissionError(f"folder must be private, for what it holds is run, but {folder} {advice}.")
 
 
 def _user_cache() -> Path:

@@ -132,7 +132,10 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
     ("argv", "said"),
     [
         (["a.npz", "other/a.npz"], "would both write a.npz"),
-        (["a.npz", "-o", "."], "holds the file"),
+        (["a.npz", "-o", "."], "holds the file a.npz"),
+        (["a.npz", "-o", "other"], "holds the file a.npz"),  # a link to it
+        (["grid.npz", "--normals", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
+        (["grid.npz", "--boundary", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
         (["a.npz", "-o", "a.npz"], "cannot be made"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
@@ -142,6 +145,9 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
 )
 def test_bad_usage_is_one_sentence(folder, capsys, monkeypatch, argv, said):
     monkeypatch.setitem(sys.modules, "distributed", None)
+    os.mkdir("other")
+    os.symlink(folder / "a.npz", "other/a.npz")
+    os.link("b.npz", "other/grid.npz")
     output = [] if "-o" in argv else ["-o", "out"]
     assert _cli.main(["batch", *argv, *output]) == 2
     captured = capsys.readouterr()
@@ -163,28 +169,32 @@ def test_a_table_that_cannot_be_read_is_left_alone(folder, capsys):
 
 
 class Pool:
-    """Takes `width` jobs at once and finishes them in turn; jobs named "fatal" end it."""
+    """Takes `width` jobs at once, finishes them in turn; jobs named "fatal" end it, and "last" once done."""
 
     def __init__(self, width):
-        self.width, self.open, self.starts, self.ended = width, [], [], 0
+        self.width, self.open, self.starts, self.ended, self.is_broken = width, [], [], 0, False
 
     def submit(self, function, job):
+        if self.is_broken:
+            raise BrokenExecutor
         future = Future()
         self.open.append((job, future))
         self.starts.append((job, [other for other, _ in self.open[:-1]]))
         return future
 
     def finish(self):
-        if any(job.startswith("fatal") for job, _ in self.open):
+        if self.is_broken or any(job.startswith("fatal") for job, _ in self.open):
+            self.is_broken = True
             for _, future in self.open:
                 future.set_exception(BrokenExecutor())
             self.open.clear()
         elif self.open:
             job, future = self.open.pop(0)
             future.set_result(job)
+            self.is_broken = job.startswith("last")
 
     def restart(self):
-        self.ended += 1
+        self.ended, self.is_broken = self.ended + 1, False
 
 
 def run(pool, jobs, monkeypatch):
@@ -212,6 +222,14 @@ def test_a_file_that_ends_its_process_is_found_and_passed_over(monkeypatch):
     found = run(pool, ["a", "fatal", "b", "c", "fatal too", "d"], monkeypatch)
     assert sorted(found) == ["a", "b", "c", "d", "fatal died", "fatal too died"]
     assert 2 <= pool.ended <= 4
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_a_process_that_ends_between_two_files_costs_none(monkeypatch, width):
+    pool = Pool(width)
+    jobs = ["a", "last", "b", "c", "last too", "d", "e"]
+    assert sorted(run(pool, jobs, monkeypatch)) == sorted(jobs)
+    assert pool.ended == 2
 
 
 def maybe_end(job):

@@ -7,7 +7,7 @@ import pytest
 from helpers import wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit
-from jaxfit import _cli, _cli_report
+from jaxfit import _cli, _cli_report, plot
 from jaxfit.io import read_surface
 
 
@@ -114,12 +114,16 @@ def test_what_is_left_of_a_grid_with_gaps_is_a_scan(fits, folder, argv, name):
     assert made[2] == ((None,) if name == "fit_points" else ())
 
 
-def test_the_terrain_has_its_own_net(fits, folder):
+def test_the_terrain_has_its_own_net(fits, folder, monkeypatch):
     assert run("jacksboro") == 0
     name, points, _, options = fits.made[0]
     assert (name, points.shape, options["net"]) == ("fit_points", (138632, 3), (62, 57))
     assert run("jacksboro", "--net", "20x30") == 0
     assert fits.made[1][3]["net"] == (20, 30)
+    settings = []
+    monkeypatch.setattr(plot, "report", lambda *_, tables, **options: settings.append(tables["Settings"]))
+    assert run("jacksboro", "--order", "3x3", "--report", "r.html") == 0
+    assert list(settings[0]) == ["tolerances", "--order"]  # nothing that the user has not asked for
 
 
 def test_options_arrive_as_fractions(fits, folder):
@@ -270,6 +274,15 @@ def test_a_numerical_failure_writes_nothing(fits, folder, capsys, how):
     assert captured.err.count("\n") == 1
 
 
+def test_a_defect_is_told_from_a_missed_tolerance(fits, folder, capsys):
+    fits.fails = KeyError("knots")
+    assert run("cloud.npz") == 3
+    *traceback, said = capsys.readouterr().err.splitlines()
+    assert traceback[0].startswith("Traceback")
+    assert said.startswith("jaxfit: error: the fit failed; please report this defect")
+    assert said.endswith("KeyError: 'knots'")
+
+
 def test_interruption_writes_nothing(fits, folder, capsys):
     before = names(folder)
     fits.fails = KeyboardInterrupt()
@@ -294,6 +307,7 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "cloud.npz", "-o", "none/s.npz"], "does not exist; make it first"),
         (["fit", "cloud.npz", "-o", "cloud.npz"], "is the file that is read"),
         (["fit", "cloud.npz", "-o", "./border.npz", "--boundary", "border.npz"], "is read"),
+        (["fit", "grid.npz", "-o", "./border.npz", "--normals", "border.npz"], "is read"),
         (["fit", "cloud.npz", "-o", "s.npz", "--picture", "s.dwg"], "suffix .dwg"),
         (["fit", "cloud.npz", "-o", "s.npz", "--net", "5"], "'5' is no pair of counts"),
         (["fit", "cloud.npz", "-o", "s.npz", "--tol-average", "-1"], "'-1' is no percentage"),

@@ -11,7 +11,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 
 # Lowest first; a room may import its own modules and those of the lines above it.
 ROOMS = [
-    ("_interrupt", "_version"),
+    ("_interrupt", "_version", "_cores"),
     ("_checks",),
     ("_precision", "_progress_line"),
     ("_varying",),
@@ -105,6 +105,11 @@ def test_no_room_changes_the_global_configuration():
         if changes.search(path.read_text()) and room_of(path) != "_cli_session"
     ]
     assert not changed
+
+
+def test_cores_are_counted_in_one_place():
+    counts = re.compile(r"cpu_count|getaffinity|workers=-1")
+    assert [path.name for path in MODULES if counts.search(path.read_text())] == ["_cores.py"]
 
 
 def test_importing_the_package_is_light_and_changes_no_configuration():

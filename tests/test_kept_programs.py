@@ -62,6 +62,41 @@ def test_the_folder_is_that_of_option_variable_or_user(tmp_path, monkeypatch):
     assert _program_folder.cache_folder() is None
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no such modes")
+@pytest.mark.parametrize("mode", [0o770, 0o702])
+def test_a_folder_that_others_can_write_is_refused(grid, tmp_path, monkeypatch, capsys, mode):
+    folder = tmp_path / "c" / "jaxfit"
+    folder.mkdir(parents=True)
+    folder.chmod(mode)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv(_program_folder.VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "c"))
+    for asked in (None, folder):
+        with pytest.raises(PermissionError, match="can be written by others; name another, or chmod go-w"):
+            jf.keep_programs(asked)
+    assert _cli.main(["fit", "none.npz", "-o", "s.npz", "--no-picture"]) == 2
+    assert "programs are not kept (folder" in capsys.readouterr().err
+    assert not os.listdir(folder)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no such users")
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
+    with pytest.raises(PermissionError, match="belongs to another user; name another"):
+        jf.keep_programs(tmp_path)
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no such modes")
+def test_folders_are_made_for_one_user(tmp_path, monkeypatch):
+    monkeypatch.setattr(_kept_programs, "folder", None)
+    before = os.umask(0)
+    try:
+        made = jf.keep_programs(tmp_path / "programs")
+    finally:
+        os.umask(before)
+    assert [path.stat().st_mode & 0o777 for path in (made, made.parent)] == [0o700, 0o700]
+
+
 def test_what_was_not_used_for_longest_goes(tmp_path, monkeypatch):
     monkeypatch.setattr(_program_folder, "LARGEST", 250)
     folders = [tmp_path / f"version-{name}" for name in "ab"]

@@ -1,5 +1,6 @@
 """Many fits in one call: the same fits as one by one, whoever computes them."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -9,6 +10,9 @@ import pytest
 from helpers import wavy_cloud
 
 import jaxfit as jf
+from jaxfit._batch import _map_fits
+from jaxfit._cores import cores
+from jaxfit.io import PointData
 
 SIZES = (300, 260, 290)
 CLOUDS = [wavy_cloud(n, seed=n)[0] + [0, 0, 0.01 * i] for i, n in enumerate(SIZES)]
@@ -52,6 +56,21 @@ def test_a_cloud_that_is_not_finite_fails_alone():
         jf.map_fits([bad], BASE, throw=True, **OPTIONS)
 
 
+def test_fits_that_fail_have_the_stats_of_others():
+    bad = np.full_like(CLOUDS[0], np.nan)
+    (failed,) = jf.map_fits([bad], BASE, tol_average=None, tol_maximum=0.01)
+    assert (float(failed.stats["tol_average"]), float(failed.stats["tol_maximum"])) == (np.inf, 0.01)
+    assert (failed.stats["num_steps"], failed.stats["method"]) == (0, "OrthogonalDistance")
+    (failed,) = jf.map_fits([bad], BASE)
+    assert (float(failed.stats["tol_average"]), float(failed.stats["tol_maximum"])) == (6e-4, np.inf)
+
+
+def test_clouds_may_be_what_was_read_from_files():
+    bad = [PointData(np.full_like(cloud, np.nan), None, None, "scan") for cloud in CLOUDS]
+    assert [len(fit.errors) for fit in jf.map_fits(bad, BASE)] == list(SIZES)
+    assert [len(fit.errors) for fit in jf.map_fits(bad[0], [BASE, OTHER])] == [SIZES[0]] * 2
+
+
 def test_bases_lambdas_and_weights_may_differ():
     bases, lambdas = [BASE, OTHER], [1e-4, 1e-6]
     methods = [jf.StandardApproximation(smoothing=x) for x in lambdas]
@@ -60,6 +79,16 @@ def test_bases_lambdas_and_weights_may_differ():
     for i, fit in enumerate(fits):
         assert_same(fit, jf.approximate(CLOUDS[0], bases[i], methods[i], weights=weights[i], **OPTIONS))
         assert float(fit.stats["smoothing"]) == lambdas[i]
+
+
+@pytest.mark.parametrize(("granted", "expected"), [("2", 2), ("64", 3), ("0", 3), ("some", 3), (None, 3)])
+def test_threads_are_as_many_as_cores_are_granted(monkeypatch, granted, expected):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 5}, raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.delenv("NPROC", raising=False)
+    if granted is not None:
+        monkeypatch.setenv("NPROC", granted)
+    assert cores() == expected
 
 
 def test_any_executor_computes():
@@ -141,9 +170,27 @@ def test_bad_lists_get_a_sentence(arguments, said):
         jf.map_fits(*arguments, **OPTIONS)
 
 
+@pytest.mark.parametrize(
+    ("method", "options", "said"),
+    [
+        (None, {"adjoint": "implicit"}, "adjoint must be an object such as"),
+        (jf.GeometricInterpolation(), {}, "is one for grids; call interpolate"),
+        (None, {"max_steps": -1}, "max_steps must be"),
+        (None, {"errors": jf.GlobalFeet}, "errors must be an object such as"),
+    ],
+)
+def test_options_and_methods_are_checked_before_any_fit(monkeypatch, method, options, said):
+    monkeypatch.setattr(_map_fits, "_fit_group", lambda *_: pytest.fail("a fit was begun"))
+    for cloud in (CLOUDS[0], np.full_like(CLOUDS[0], np.nan)):
+        with pytest.raises((TypeError, ValueError), match=said):
+            jf.map_fits([cloud], BASE, method, **options)
+
+
 def test_names_and_sizes_get_a_sentence():
     with pytest.raises(TypeError, match="progress is not an option of map_fits; pass any of tol_average"):
         jf.map_fits(CLOUDS, BASE, progress=print)
+    with pytest.raises(TypeError, match=r"clouds\[0\]: points must hold real numbers, but has dtype"):
+        jf.map_fits([np.full((4, 3), "x")], BASE)
     with pytest.raises(ValueError, match="clouds must hold at least one cloud"):
         jf.pad_clouds([])
     with pytest.raises(ValueError, match="weights must hold one number for each point"):

@@ -108,6 +108,8 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys):
     assert page.headings[:4] == ["cloud", "Input", "Settings", "Output"]
     pairs = dict(zip(page.cells[::2], page.cells[1::2], strict=True))
     assert pairs["--loss"] == "huber"
+    given = {name for name in pairs if name.startswith("--")}
+    assert given == {"--net", "--max-steps", "--tol-average", "--loss", "--method"}
     assert (pairs["--net"], pairs["--tol-average"], pairs["points"]) == ("6x6", "5 %", "200")
     assert "s.npz, r.html" in " ".join(capsys.readouterr().out.split())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.npz", "r.html", "s.npz"]

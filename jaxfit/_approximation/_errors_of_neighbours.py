@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit._cores import cores
 from jaxfit._fit._result import Fit
 
 PATCH = 9  # points: one and those with the nearest feet
@@ -32,7 +33,7 @@ def errors_of_neighbours(fit: Fit, points: Float[np.ndarray, "points d"]) -> Err
     surface, feet = fit.surface, np.stack([np.asarray(x, float) for x in (fit.u, fit.v)], axis=1)
     spans = [n / float(end - begin) for n, (begin, end) in zip(surface.shape, surface.domain, strict=True)]
     places = np.nan_to_num(feet) * spans  # of a fit that has diverged, whose errors are not finite either
-    beside = KDTree(places, balanced_tree=False).query(places, PATCH, workers=-1)[1]
+    beside = KDTree(places, balanced_tree=False).query(places, PATCH, workers=cores())[1]
     farthest = np.median(np.asarray(fit.errors)[beside], axis=1).max()
     knots = np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float)
     spline = NdBSpline(knots, np.asarray(surface.control_points, float), tuple(k - 1 for k in surface.order))

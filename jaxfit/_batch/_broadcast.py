@@ -40,7 +40,7 @@ def requests_of(clouds: Any, base: Any, method: Any, weights: Any) -> list[Reque
         )
     count = next(iter(lengths.values()))
     columns = [given[name] if name in lengths else [given[name]] * count for name in given]
-    requests = [Request(*row) for row in zip(*columns, strict=True)]
+    requests = [Request(getattr(row[0], "cloud", row[0]), *row[1:]) for row in zip(*columns, strict=True)]
     for i, request in enumerate(requests):
         check_kind(f"base[{i}]", request.base, BSplineSurface, "base_surface(boundary)")
         if request.method is not None:

@@ -10,12 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._approximation import approximate
-from jaxfit._approximation._checked_arguments import checked_request
+from jaxfit._approximation._checked_arguments import check_options, checked_request
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._batch._broadcast import Request, one_by_one, requests_of
 from jaxfit._batch._failed_fit import failed_fit
-from jaxfit._batch._worker_processes import cores
 from jaxfit._checks import as_points, is_concrete
+from jaxfit._cores import cores
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._precision import bucket, working_dtype
@@ -27,7 +27,7 @@ _LARGEST_GROUP = 16  # fits that go to a worker at once
 
 @shows_progress("fitting clouds")
 def map_fits(
-    clouds: ArrayLike | Sequence[ArrayLike],
+    clouds: Any,
     base: BSplineSurface | Sequence[BSplineSurface],
     method: AbstractIterativeMethod | Sequence[AbstractIterativeMethod] | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
@@ -44,7 +44,7 @@ def map_fits(
     Parameters
     ----------
     clouds : list of arrays (points, d), array (fits, points, d), or one array (points, d)
-        They may differ in size.
+        They may differ in size. Each may be what `jaxfit.io.read_points` has read.
     base : BSplineSurface, or a list of them
     method : a method of `approximate`, or a list of them, optional
         So are lambdas given: ``[jf.StandardApproximation(smoothing=x) for x in lambdas]``.
@@ -55,7 +55,7 @@ def map_fits(
     throw : bool
         Raise a RuntimeError for the first fit that has not converged, once all are done.
     options
-        As for `approximate`: tol_average, tol_maximum, max_steps, errors. The same for all.
+        As for `approximate`: tol_average, tol_maximum, max_steps, errors, adjoint. The same for all.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def map_fits(
     finite = [i for i, x in enumerate(requests) if _is_finite(x)]
     done = dict(zip(finite, _run([requests[i] for i in finite], executor, options), strict=True))
     fits = tuple(
-        done[i] if i in done else failed_fit(x.cloud, x.base, x.method) for i, x in enumerate(requests)
+        done[i] if i in done else failed_fit(x, {**_OPTIONS, **options}) for i, x in enumerate(requests)
     )
     return _raised(fits) if throw else fits
 
@@ -158,17 +158,20 @@ def _raised(fits: Sequence[Fit]) -> tuple[Fit, ...]:
 def _check(index: int, request: Request, options: dict[str, Any]) -> None:
     """Raise the sentence of `approximate`, with the number of the cloud, for anything but a NaN in it."""
     try:
+        check_options(request.method, progress=None, throw=False, **{**_OPTIONS, **options})
         numbers = request.cloud if _is_finite(request) else np.nan_to_num(request.cloud)
         cloud = as_points("points", numbers, request.base.dimension, least=LEAST_POINTS)
-        checked_options = {name: x for name, x in options.items() if name in _CHECKED}
         if _is_finite(request):
-            checked_request(cloud, request.base.domain, weights=request.weights, **checked_options)
+            checked_request(cloud, request.base.domain, weights=request.weights)
     except (ValueError, TypeError) as error:
         raise type(error)(f"clouds[{index}]: {error}") from error
 
 
 def _is_finite(request: Request) -> bool:
-    return bool(np.isfinite(np.asarray(request.cloud)).all())
+    try:
+        return bool(np.isfinite(np.asarray(request.cloud)).all())
+    except (TypeError, ValueError):
+        return True  # it holds no numbers, which is said in the sentence of `approximate`
 
 
 def _check_names(options: dict[str, Any]) -> None:
@@ -177,9 +180,8 @@ def _check_names(options: dict[str, Any]) -> None:
             raise TypeError(f"{name} is not an option of map_fits; pass any of {', '.join(_OPTIONS)}.")
 
 
-_CHECKED = ("tol_average", "tol_maximum", "max_steps", "errors")
-_OPTIONS = [
-    name
-    for name in inspect.signature(approximate).parameters
+_OPTIONS = {
+    name: parameter.default
+    for name, parameter in inspect.signature(approximate).parameters.items()
     if name not in ("points", "base", "method", "weights", "start", "progress", "throw")
-]
+}

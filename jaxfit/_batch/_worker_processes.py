@@ -13,6 +13,7 @@ import jax
 
 from jaxfit import _kept_programs
 from jaxfit._checks import check_number
+from jaxfit._cores import VARIABLE, cores
 from jaxfit._precision import working_dtype
 
 _HANDED_ON = (
@@ -72,18 +73,12 @@ def worker_processes(workers: int | None = None) -> Iterator[ProcessPoolExecutor
     end_processes(pool)
 
 
-def cores() -> int:
-    """How many this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
 def started_processes(workers: int) -> ProcessPoolExecutor:
     """Processes with the settings of the session."""
     settings = {name.upper(): getattr(jax.config, name, None) for name in _HANDED_ON}
     ours = {name: str(x) for name, x in settings.items() if x is not None}
     # JAX reads all of this as it starts.
-    ours["NPROC"] = str(max(1, cores() // workers))
+    ours[VARIABLE] = str(max(1, cores() // workers))
     before = {name: os.environ.get(name) for name in ours}
     os.environ.update(ours)
     try:

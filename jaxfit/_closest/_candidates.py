@@ -7,7 +7,6 @@ exceeds the foot's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv 
 only. Every sample this close that is not beside a foot already found is a start.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._closest._samples import Samples
+from jaxfit._cores import cores
 
 WIDER = 1.5  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
@@ -48,7 +48,7 @@ class Search:
 
     def nearest(self, points: Float[np.ndarray, "points d"]) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of the nearest sample of every point."""
-        return self.parameters(self.tree.query(points, workers=-1)[1])
+        return self.parameters(self.tree.query(points, workers=cores())[1])
 
     def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of samples given by number."""
@@ -74,7 +74,7 @@ class Search:
     ) -> "StartCandidates":
         """The samples that may lead to a foot nearer to the points than those at (u, v)."""
         parts = [slice(begin, begin + BLOCK) for begin in range(0, len(distance), BLOCK)]
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(lambda part: self._candidates_of(part, points, u, v, distance), parts))
         who, sample = (np.concatenate(x) for x in zip(*found, strict=True))
         return StartCandidates(self, points, who, sample)

@@ -1,6 +1,5 @@
 """Nearest feet of concrete points: padded to common sizes; searched for above the reach of the surface."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Any
@@ -17,6 +16,7 @@ from jaxfit._closest._project import project
 from jaxfit._closest._reach import Reach
 from jaxfit._closest._samples import sample
 from jaxfit._compile import compiled
+from jaxfit._cores import cores
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
@@ -217,7 +217,7 @@ def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostF
 
     if len(parts) == 1:
         return one(parts[0])
-    with ThreadPoolExecutor(min(len(parts), os.cpu_count() or 1)) as pool:
+    with ThreadPoolExecutor(min(len(parts), cores())) as pool:
         pieces = list(pool.map(one, parts))
     return {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
 

@@ -10,7 +10,6 @@ is taken over pairs of neighbouring samples. Farther ones are at least a radius 
 R / 2. What lies between samples is left to a factor of safety: this is an estimate, not a proof.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit._closest._samples import grid_jet
+from jaxfit._cores import cores
 from jaxfit._splines._pieces import Axis
 
 SAFETY = 0.3  # of the reach, which is sampled
@@ -70,7 +70,7 @@ class Reach:
         asked[place] = True
         number = np.flatnonzero(_around(asked.reshape(a - 1, b - 1), np.logical_or, False))
         parts = [number[begin : begin + BLOCK] for begin in range(0, number.size, BLOCK)]
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(cores()) as pool:
             found = list(pool.map(self._reach_at, parts))
         reach = np.full(a * b, np.inf)
         reach[number] = np.concatenate(found)

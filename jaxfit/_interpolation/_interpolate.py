@@ -50,8 +50,9 @@ def interpolate(
     grid : array (n, m, d)
         Any unit; at least `order` points in each direction. Or what `jaxfit.io.read_points` has read, if that
         is a grid.
-    method : GeometricInterpolation or StandardInterpolation, optional
-        Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals.
+    method : GeometricInterpolation(), StandardInterpolation() or NormalInterpolation(), optional
+        Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals: it alone meets
+        them, and needs them.
     order : (K, L)
         Degree + 1 along the first and the second index, each 2 to 8.
     tolerance : float, optional
@@ -66,7 +67,7 @@ def interpolate(
     throw : bool
         Raise a RuntimeError with the reason instead of returning a fit that has not converged.
     normals : array (n, m, 3), optional
-        Unit normals of the surface at the points, for `NormalInterpolation`.
+        Unit normals of the surface at the points; only with `NormalInterpolation`, and always with it.
 
     Returns
     -------
@@ -77,7 +78,8 @@ def interpolate(
     ------
     ValueError
         If the grid has the wrong shape, too few points, entries that are not finite, or no extent; or
-        normals do not fit the grid, are no unit vectors, or are given to a method that does not meet them.
+        normals do not fit the grid, are no unit vectors, are given to a method that does not meet them, or
+        are missing for the one that does.
 
     Notes
     -----

@@ -1,6 +1,5 @@
 """`Passes`: one pass over the blocks after the other, each with the same compiled program for all blocks."""
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +15,7 @@ from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._approximation._methods_by_sums import static_and_numbers
 from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
+from jaxfit._cores import cores
 from jaxfit._fit._method import Iterate
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._projection import Projection
@@ -158,7 +158,7 @@ def in_threads(work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any
 
     The first item goes alone, for it compiles what the others use.
     """
-    threads = min(os.cpu_count() or 1, MOST_THREADS)
+    threads = min(cores(), MOST_THREADS)
     waiting: deque[Future[Any]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         for number, item in enumerate(items):
