@@ -154,8 +154,10 @@ def test_what_is_no_sheet_is_said(points, sentence):
         lambda x, y: 6 * np.sin(x / 15) * np.cos(y / 12),
         lambda x, y: np.round(6 * np.sin(x / 15) * np.cos(y / 12), 1),
         lambda x, y: 1e-2 * ((x - 30) ** 2 + (y - 20) ** 2),
+        lambda x, y: 5 * np.sin(x / 20),
+        lambda x, y: 0.02 * (x - 30) ** 2,
     ],
-    ids=["waves", "rounded", "bowl"],
+    ids=["waves", "rounded", "bowl", "bent one way", "trough"],
 )
 def test_a_bent_grid_without_gaps_has_all_its_triangles(heights):
     x, y = (a.ravel() for a in np.meshgrid(np.arange(60.0), np.arange(45.0), indexing="ij"))
@@ -174,6 +176,24 @@ def test_the_rim_of_scan_lines_has_no_notches(ratio):
     assert len(sheet.loops) == 1
     rim = (sheet.nodes[sheet.loops[0]] * sheet.size + sheet.centre)[:, :2]
     assert np.minimum(rim, 1 - rim).min(axis=1).max() < 1 / 29
+
+
+@pytest.mark.parametrize("along", [60, 100, 200, 1000])
+def test_few_scan_lines_have_no_wedges_between_them(along):
+    """Stars of neighbouring lines disagree on the diagonal where the sheet bends."""
+    x, y = np.meshgrid(np.linspace(-1, 1, along), np.linspace(-1, 1, 15), indexing="ij")
+    sheet = sheet_of(np.stack([x, y, 0.3 * np.sin(3 * x) * np.cos(2 * y)], axis=2).reshape(-1, 3))
+    assert len(sheet.loops) == 1
+    rim = (sheet.nodes[sheet.loops[0]] * sheet.size + sheet.centre)[:, :2]
+    assert (1 - np.abs(rim)).min(axis=1).max() < 0.1
+    assert sheet.area > 0.96 * 4.496
+
+
+def test_notches_are_filled_and_nothing_else():
+    """Around a point a fan of three triangles with a gap of one; the fifth has one edge in common with it."""
+    fan = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4]])
+    ear, other = [0, 4, 1], [2, 1, 5]
+    np.testing.assert_array_equal(manifold(fan, np.array([other, ear])), [*fan.tolist(), ear])
 
 
 @pytest.mark.parametrize("lines", [14, 34])

@@ -19,9 +19,9 @@ from jaxfit._base._default_net import default_net as default_net
 from jaxfit._base._default_net import default_size as default_size
 from jaxfit._base._default_net import net_of_ratio as net_of_ratio
 from jaxfit._base._default_net import net_of_size as net_of_size
-from jaxfit._base._delaunay_stars import COCIRCULAR as COCIRCULAR
 from jaxfit._base._delaunay_stars import Planes as Planes
 from jaxfit._base._delaunay_stars import Stars as Stars
+from jaxfit._base._delaunay_stars import share_on_circles as share_on_circles
 from jaxfit._base._delaunay_stars import stars as stars
 from jaxfit._base._delaunay_stars import supported_planes as supported_planes
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface

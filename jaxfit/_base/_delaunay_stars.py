@@ -207,8 +207,7 @@ def _hulls(
     members: np.ndarray, filled: np.ndarray, plane: np.ndarray, straight: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Drop the neighbours that are no Delaunay neighbours."""
-    square = _dot(plane, plane)
-    flipped = plane / np.where(square > 0, square, 1.0)[..., None]
+    flipped = _inverted(plane)
     rows = np.arange(len(members))  # those in which something was dropped last time
     while len(rows):
         part, there = flipped[rows], filled[rows]
@@ -228,6 +227,23 @@ def _hulls(
         members[rows], filled[rows], plane[rows], flipped[rows] = parts
     width = int(filled.sum(axis=1).max())
     return members[:, :width], filled[:, :width], plane[:, :width]
+
+
+def share_on_circles(star: Stars, straight: float) -> float:
+    """The share of stars of which a neighbour lies on a circle with the two beside it and the point itself,
+    to a sine of `straight`.
+    """
+    flipped = _inverted(star.plane)
+    before, after = cyclic_neighbours(flipped, star.filled)
+    turn = _cross(flipped - before, after - flipped)
+    size = _norm(flipped - before) * _norm(after - flipped)
+    between = star.filled & (star.filled.sum(axis=1) > 2)[:, None]
+    return float((between & (np.abs(turn) <= straight * size)).any(axis=1).mean())
+
+
+def _inverted(plane: np.ndarray) -> np.ndarray:
+    square = _dot(plane, plane)
+    return plane / np.where(square > 0, square, 1.0)[..., None]
 
 
 def cyclic_neighbours(

@@ -8,20 +8,31 @@ from jaxtyping import Bool, Float, Int
 Faces = Int[Any, "_ 3"]
 
 
-def manifold(candidates: Faces) -> Faces:
+def manifold(candidates: Faces, ears: Faces | None = None) -> Faces:
     """The oriented triangles, taken greedily in the order given, that make a 2-manifold with boundary.
 
     A triangle whose directed edge is taken already lies on the same side of that edge as another one, so it
     is passed over: neighbouring triangles of an oriented surface run along their edge in opposite directions.
+    Of the `ears` those are taken after all others that have two or three edges on the boundary.
     """
     taken: set[tuple[int, int]] = set()
-    kept = []
-    for number, (a, b, c) in enumerate(candidates.tolist()):
+    found = _added(candidates.tolist(), taken, 0)
+    rest = [] if ears is None else ears.tolist()
+    while more := _added(rest, taken, 2):
+        found += more
+    return single_fans(np.asarray(found, int).reshape(-1, 3))
+
+
+def _added(candidates: list[list[int]], taken: set[tuple[int, int]], shared: int) -> list[list[int]]:
+    """Candidates none of whose edges is taken, and `shared` of them the other way round; these are then."""
+    added = []
+    for face in candidates:
+        a, b, c = face
         edges = ((a, b), (b, c), (c, a))
-        if taken.isdisjoint(edges):
+        if taken.isdisjoint(edges) and (not shared or sum((y, x) in taken for x, y in edges) >= shared):
             taken.update(edges)
-            kept.append(number)
-    return single_fans(candidates[kept])
+            added.append(face)
+    return added
 
 
 def single_fans(faces: Faces) -> Faces:

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxfit._base import COCIRCULAR, Planes, Stars, stars, supported_planes
+from jaxfit._base import Planes, Stars, share_on_circles, stars, supported_planes
 from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
 PLANE_NEIGHBOURS = 16  # of a point, that make its tangent plane
 NEIGHBOURS = 24  # among which its star is searched: near another sheet some are on that
 ALIKE = 0.5  # least cosine between normals of corners that are surely on one sheet
 STRAIGHT = 2e-2  # sine of an angle of a star's hull: points of a grid of whole numbers are on a circle still,
-GRID = 0.15  # and where so many stars have more neighbours by it, points make a grid; at random 0.1 have
+GRID = 0.25  # and where so many stars have a point on a circle, points make a grid; at random 0.17 have
 WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
 
 
@@ -22,20 +22,21 @@ def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_vote
     Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
     come first, then those in at least `least_votes` that fit in between, the shortest first. Among noise
-    triangles in one star make bridges. Triangles between corners whose normals differ much come last: they
-    may join sheets that face each other.
+    triangles in one star make bridges, so of others only those are taken that fill a notch. Triangles between
+    corners whose normals differ much come last: they may join sheets that face each other.
     """
     planes = supported_planes(points, PLANE_NEIGHBOURS)
     star = _stars(planes)
     faces, votes = _candidates(star)
     longest = longest_edges(points, faces)
-    chosen = (longest <= length) & (votes >= least_votes)
-    faces, votes, longest = faces[chosen], votes[chosen], longest[chosen]
+    short = longest <= length
+    faces, votes, longest = faces[short], votes[short], longest[short]
     assert planes.normals is not None
     corners = planes.normals[faces]
     unlike = (np.sum(corners * np.roll(corners, 1, axis=1), axis=2) < ALIKE).any(axis=1)
-    faces = faces[np.lexsort((longest, -votes, unlike))]
-    return manifold(_oriented(points, planes.normals, faces))
+    order = np.lexsort((longest, -votes, unlike))
+    faces, agreed = _oriented(points, planes.normals, faces[order]), votes[order] >= least_votes
+    return manifold(faces[agreed], faces[~agreed])
 
 
 def _stars(planes: Planes) -> Stars:
@@ -43,12 +44,10 @@ def _stars(planes: Planes) -> Stars:
     four see both, of which the shorter one is taken.
     """
     count = len(planes.points)
-    exact, wide = (
-        stars(planes.points, NEIGHBOURS, fixed=count, planes=planes, straight=straight)
-        for straight in (COCIRCULAR, STRAIGHT)
-    )
-    more = (wide.filled.sum(axis=1) > exact.filled.sum(axis=1)).mean()
-    return wide if more > GRID else exact
+    wide = stars(planes.points, NEIGHBOURS, fixed=count, planes=planes, straight=STRAIGHT)
+    if share_on_circles(wide, STRAIGHT) > GRID:
+        return wide
+    return stars(planes.points, NEIGHBOURS, fixed=count, planes=planes)
 
 
 def _candidates(star: Stars) -> tuple[Faces, Int[np.ndarray, " faces"]]:
