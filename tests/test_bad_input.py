@@ -329,6 +329,14 @@ def test_a_number_that_is_none_is_not_to_be_raised():
             )
         ),
         (lambda: inspect.unwrap(jf.base_surface)(POINTS), r"or Boundary.from_grid\(grid\), but is a ndarray"),
+        (
+            lambda: inspect.unwrap(jf.interpolate)(GRID, progress=5),
+            "progress must be callable, but is 5; pass a function of",
+        ),
+        (
+            lambda: inspect.unwrap(jf.interpolate)(GRID, throw="no"),
+            "throw must be True or False, but is 'no'",
+        ),
         (lambda: jf.fit_points(POINTS, BOUNDARY, degree=3), "degree is not an option .* pass order"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, nett=3), "pass any of boundary, net, order, method, base"),
         (

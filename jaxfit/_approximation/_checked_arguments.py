@@ -8,7 +8,15 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxfit._approximation._errors import AbstractErrors
-from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
+from jaxfit._checks import (
+    as_floating,
+    check_kind,
+    check_number,
+    check_progress,
+    check_steps,
+    check_switch,
+    is_concrete,
+)
 from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._scaling import Unit, unit_of
@@ -55,6 +63,7 @@ def check_options(
 ) -> None:
     """Raise unless the options of a fit are valid that say nothing about single points."""
     check_switch("throw", throw)
+    check_progress(progress)
     if hasattr(method, "check_normals"):  # which only methods for grids have
         name = type(method).__name__
         raise TypeError(
@@ -80,11 +89,6 @@ def check_options(
         raise ValueError(
             "tol_average and tol_maximum must not both be None, for every surface meets that; pass "
             "tol_average=0.0 to go on until the errors stop falling."
-        )
-    if progress is not None and not callable(progress):
-        raise TypeError(
-            f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "
-            "maximum)."
         )
 
 
