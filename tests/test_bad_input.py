@@ -18,6 +18,7 @@ from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit as jf
 from jaxfit import _cli
+from jaxfit._approximation._sharded_fit import fit_sharded_cloud
 from jaxfit._approximation._smoothing_term import check_smoothing
 from jaxfit._checks import as_floating, check_number
 from jaxfit._fit._border import check_border
@@ -212,6 +213,26 @@ def masked(x, count=3):
 def test_masked_entries_are_refused(name, call):
     with pytest.raises(ValueError, match=f"{name} must not be masked, but 3 of its") as error:
         call()
+    sentence(error)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"weights": np.ones(59)}, "weights must hold one number for each of the 60 points"),
+        ({"weights": -np.ones(60)}, "weights must not be negative"),
+        ({"start": (np.ones(59), np.ones(59))}, "start must hold a u and a v for each of the 60 points"),
+        ({"start": (np.ones(60), 2 * np.ones(60))}, r"start v must lie in the domain \[0, 1\]"),
+        ({"start": 5}, "start must be a pair"),
+    ],
+)
+def test_rows_of_a_divided_cloud_are_checked_before_they_are_sent(options, said, monkeypatch):
+    points, _ = jf.shard_points(POINTS, jax.make_mesh((1,), ("points",)))
+    parameters = inspect.signature(jf.approximate).parameters.values()
+    request = {x.name: x.default for x in parameters if x.default is not x.empty}
+    monkeypatch.setattr(jax, "device_put", None)
+    with pytest.raises(ValueError, match=said) as error:
+        fit_sharded_cloud(points, wavy_surface(), jf.GeometricApproximation(), request | options)
     sentence(error)
 
 

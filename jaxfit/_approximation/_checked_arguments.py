@@ -117,11 +117,17 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Any:
             f"weights must hold one number for each of the {count} points, but has shape "
             f"{weight.shape}; give both the same length."
         )
-    if is_concrete(weight) and (np.asarray(weight).min() < 0 or not np.asarray(weight).any()):
+    if is_concrete(weight):
+        check_weight_range(np.asarray(weight).min(), np.asarray(weight).max())
+    return weight
+
+
+def check_weight_range(least: Any, most: Any) -> None:
+    """Raise unless the least and the greatest weight are those of weights that a fit can have."""
+    if least < 0 or not most > 0:
         raise ValueError(
             "weights must not be negative and not all zero; give each point a weight of 0 or more."
         )
-    return weight
 
 
 def checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
@@ -135,13 +141,17 @@ def checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
             f"{u.shape} and {v.shape}; give one pair per point."
         )
     for name, x, limits in zip("uv", (u, v), domain or (), strict=False):
-        if not is_concrete(x, limits):
-            continue
-        low, high = (float(y) for y in limits)
-        slack = OUTSIDE * (high - low)
-        if np.asarray(x).min() < low - slack or np.asarray(x).max() > high + slack:
-            raise ValueError(
-                f"start {name} must lie in the domain [{low:g}, {high:g}] of the base surface, but reaches "
-                f"from {np.asarray(x).min():g} to {np.asarray(x).max():g}; give parameters on that surface."
-            )
+        if is_concrete(x, limits):
+            check_start_range(name, np.asarray(x).min(), np.asarray(x).max(), limits)
     return u, v
+
+
+def check_start_range(name: str, least: Any, most: Any, limits: Any) -> None:
+    """Raise unless feet from `least` to `most` lie within the `limits` of the domain."""
+    low, high = (float(y) for y in limits)
+    slack = OUTSIDE * (high - low)
+    if not (least >= low - slack and most <= high + slack):
+        raise ValueError(
+            f"start {name} must lie in the domain [{low:g}, {high:g}] of the base surface, but reaches "
+            f"from {least:g} to {most:g}; give parameters on that surface."
+        )
