@@ -197,6 +197,7 @@ def masked(x, count=3):
     ("name", "call"),
     [
         ("points", lambda: jf.fit_points(masked(POINTS), BOUNDARY)),
+        ("points", lambda: jf.fit_points(masked(POINTS))),
         ("points", lambda: jf.approximate(masked(POINTS), wavy_surface())),
         ("points", lambda: jf.closest_point(wavy_surface(), masked(POINTS))),
         ("weights", lambda: jf.fit_points(POINTS, BOUNDARY, weights=masked(np.ones(60)))),
@@ -270,6 +271,19 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         check_smoothing(value, "a rule")
 
 
+@pytest.mark.parametrize("value", [9.0, 2.5, np.nan, np.float64(9.0), np.array(9.0)])
+def test_whole_numbers_are_no_floats(value):
+    with pytest.raises(ValueError, match=r"x must be a whole number .*; pass a whole number\."):
+        check_number("x", value, 1, whole=True)
+    for whole in (9, np.int32(9), np.array(9)):
+        check_number("x", whole, 1, whole=True)
+
+
+def test_a_number_that_is_none_is_not_to_be_raised():
+    with pytest.raises(ValueError, match="x must be a number of at least 0, but is nan; pass a number"):
+        check_number("x", np.nan, 0.0)
+
+
 @pytest.mark.parametrize(
     ("call", "advice"),
     [
@@ -302,19 +316,6 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
     with pytest.raises(ValueError, match=advice) as error:
         call()
     sentence(error)
-
-
-@pytest.mark.parametrize("value", [9.0, 2.5, np.nan, np.float64(9.0), np.array(9.0)])
-def test_whole_numbers_are_no_floats(value):
-    with pytest.raises(ValueError, match=r"x must be a whole number .*; pass a whole number\."):
-        check_number("x", value, 1, whole=True)
-    for whole in (9, np.int32(9), np.array(9)):
-        check_number("x", whole, 1, whole=True)
-
-
-def test_a_number_that_is_none_is_not_to_be_raised():
-    with pytest.raises(ValueError, match="x must be a number of at least 0, but is nan; pass a number"):
-        check_number("x", np.nan, 0.0)
 
 
 @pytest.mark.parametrize(
