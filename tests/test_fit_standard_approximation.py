@@ -182,6 +182,13 @@ def test_a_solver_of_another_kind_gets_a_sentence():
         jf.StandardApproximation(solver="cholesky")
 
 
+@pytest.mark.parametrize("solver", [jf.LevenbergMarquardt, jf.JaxoptGaussNewton, jf.JaxoptLevenbergMarquardt])
+@pytest.mark.parametrize("options", [{"tolerance": -1.0}, {"max_steps": 0}])
+def test_impossible_options_of_a_driver_get_a_sentence(solver, options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be a"):
+        solver(**options)
+
+
 def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
     rng = np.random.default_rng(0)
     noisy = POINTS + 0.01 * rng.normal(size=POINTS.shape)
