@@ -1,5 +1,7 @@
 """Standard approximation: every round is the least-squares fit of (8), whatever solves it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,6 +135,13 @@ def test_without_parameter_correction_one_solve_is_the_fit(base, one):
     assert apart(fit, np.asarray(one.surface.control_points)) < 1e-12
     assert np.abs(np.asarray(fit.errors) - np.asarray(one.errors)).max() < 1e-9
     assert float(fit.average_error) <= float(fit.history.average[-1])
+
+
+def test_without_parameter_correction_the_stall_window_stays_as_given():
+    once = jf.StandardApproximation(parameter_correction=False)
+    assert (once.stall_window, once.stall_after) == (20, 1)
+    corrected = dataclasses.replace(once, parameter_correction=True)
+    assert (corrected.stall_window, corrected.stall_after) == (20, 20)
 
 
 def test_without_parameter_correction_errors_are_true_distances_inside_jit_too(base):

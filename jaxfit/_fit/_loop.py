@@ -204,7 +204,7 @@ def _decide(
     average, maximum = history.at(step)[0], history.at(step)[1]
     finite = jnp.isfinite(average + maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
     met = (average <= goal.average) & (maximum <= goal.maximum)
-    stalled = history.is_stalled(step, method.stall_window, method.stall_gain, method.stall_since)
+    stalled = history.is_stalled(step, method.stall_after, method.stall_gain, method.stall_since)
     outcomes = (
         (~finite | (average > MAX_GROWTH * history.first), RESULTS.diverged),
         (met, RESULTS.converged),
