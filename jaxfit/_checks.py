@@ -1,5 +1,6 @@
 """Checks of what users hand in: one sentence each, before anything is compiled."""
 
+import operator
 import os
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -253,9 +254,18 @@ def check_switch(name: str, value: Any) -> None:
         raise TypeError(f"{name} must be True or False, but is {value!r}; pass either.")
 
 
+def check_progress(value: Any) -> None:
+    """Raise unless `value` is None or may be called, as the `progress` of a fit is."""
+    if value is not None and not callable(value):
+        raise TypeError(
+            f"progress must be callable, but is {value!r}; pass a function of (step, max_steps, average, "
+            "maximum)."
+        )
+
+
 def check_number(name: str, value: Any, least: int | float, whole: bool = False) -> None:
-    """Raise unless a concrete `value` is one finite number, at least `least`, and whole (and no larger than
-    numbers of 32 bits) if so asked. True and False are no numbers."""
+    """Raise unless a concrete `value` is one finite number, at least `least`, and if so asked `whole`: no
+    float, and no larger than numbers of 32 bits. True and False are no numbers."""
     if not is_concrete(value):
         return
     kind = "a whole number" if whole else "a number"
@@ -265,12 +275,23 @@ def check_number(name: str, value: Any, least: int | float, whole: bool = False)
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(f"{name} must be {kind}, but is {value!r}; pass {kind}.") from error
-    if whole and number > LARGEST_COUNT:
-        raise ValueError(f"{name} must be at most {LARGEST_COUNT}, but is {number:g}; lower it.")
     if number == np.inf:
         raise ValueError(f"{name} must be finite, but is {number:g}; lower it.")
-    if not number >= least or (whole and number != int(number)):
+    if np.isnan(number) or (whole and not _is_index(value)):
+        raise ValueError(f"{name} must be {kind} of at least {least:g}, but is {value!r}; pass {kind}.")
+    if whole and number > LARGEST_COUNT:
+        raise ValueError(f"{name} must be at most {LARGEST_COUNT}, but is {number:g}; lower it.")
+    if number < least:
         raise ValueError(f"{name} must be {kind} of at least {least:g}, but is {number:g}; raise it.")
+
+
+def _is_index(value: Any) -> bool:
+    """Whether a number is an integer by its type, as `range` and shapes ask for."""
+    try:
+        operator.index(value)
+    except TypeError:
+        return False
+    return True
 
 
 def check_steps(name: str, value: Any) -> None:

@@ -72,13 +72,17 @@ def compared(method):
     }
 
 
+DIVIDED = jf.shard_points(ALL, MESH)[1]
 REFUSED = {
     "adjoint": dict(adjoint=jf.ImplicitAdjoint()),
     "progress": dict(progress=lambda *_: None),
     "insertion": dict(method=jf.OrthogonalDistance(insertion=jf.KnotInsertion())),
     "loss": dict(method=jf.GeometricApproximation(loss=jf.Tukey())),
     "weights": dict(weights=-np.ones(COUNT + 7)),
-    "points": dict(weights=np.full(COUNT + 7, np.nan)),
+    "number of weights": dict(weights=np.ones(COUNT)),
+    "length of start": dict(start=2 * jf.shard_points(ALL[:80], MESH)[1:]),
+    "start": dict(start=(DIVIDED, 5 * DIVIDED)),
+    "points": dict(weights=np.nan * DIVIDED),
 }
 
 

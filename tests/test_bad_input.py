@@ -18,6 +18,7 @@ from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit as jf
 from jaxfit import _cli
+from jaxfit._approximation._sharded_fit import fit_sharded_cloud
 from jaxfit._approximation._smoothing_term import check_smoothing
 from jaxfit._checks import as_floating, check_number
 from jaxfit._fit._border import check_border
@@ -196,6 +197,7 @@ def masked(x, count=3):
     ("name", "call"),
     [
         ("points", lambda: jf.fit_points(masked(POINTS), BOUNDARY)),
+        ("points", lambda: jf.fit_points(masked(POINTS))),
         ("points", lambda: jf.approximate(masked(POINTS), wavy_surface())),
         ("points", lambda: jf.closest_point(wavy_surface(), masked(POINTS))),
         ("weights", lambda: jf.fit_points(POINTS, BOUNDARY, weights=masked(np.ones(60)))),
@@ -212,6 +214,26 @@ def masked(x, count=3):
 def test_masked_entries_are_refused(name, call):
     with pytest.raises(ValueError, match=f"{name} must not be masked, but 3 of its") as error:
         call()
+    sentence(error)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"weights": np.ones(59)}, "weights must hold one number for each of the 60 points"),
+        ({"weights": -np.ones(60)}, "weights must not be negative"),
+        ({"start": (np.ones(59), np.ones(59))}, "start must hold a u and a v for each of the 60 points"),
+        ({"start": (np.ones(60), 2 * np.ones(60))}, r"start v must lie in the domain \[0, 1\]"),
+        ({"start": 5}, "start must be a pair"),
+    ],
+)
+def test_rows_of_a_divided_cloud_are_checked_before_they_are_sent(options, said, monkeypatch):
+    points, _ = jf.shard_points(POINTS, jax.make_mesh((1,), ("points",)))
+    parameters = inspect.signature(jf.approximate).parameters.values()
+    request = {x.name: x.default for x in parameters if x.default is not x.empty}
+    monkeypatch.setattr(jax, "device_put", None)
+    with pytest.raises(ValueError, match=said) as error:
+        fit_sharded_cloud(points, wavy_surface(), jf.GeometricApproximation(), request | options)
     sentence(error)
 
 
@@ -247,6 +269,19 @@ def test_switches_arrays_and_text_are_no_numbers(value):
         check_number("x", value, 0.0)
     with pytest.raises(ValueError, match="smoothing must be a finite number"):
         check_smoothing(value, "a rule")
+
+
+@pytest.mark.parametrize("value", [9.0, 2.5, np.nan, np.float64(9.0), np.array(9.0)])
+def test_whole_numbers_are_no_floats(value):
+    with pytest.raises(ValueError, match=r"x must be a whole number .*; pass a whole number\."):
+        check_number("x", value, 1, whole=True)
+    for whole in (9, np.int32(9), np.array(9)):
+        check_number("x", whole, 1, whole=True)
+
+
+def test_a_number_that_is_none_is_not_to_be_raised():
+    with pytest.raises(ValueError, match="x must be a number of at least 0, but is nan; pass a number"):
+        check_number("x", np.nan, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -316,6 +351,14 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
             )
         ),
         (lambda: inspect.unwrap(jf.base_surface)(POINTS), r"or Boundary.from_grid\(grid\), but is a ndarray"),
+        (
+            lambda: inspect.unwrap(jf.interpolate)(GRID, progress=5),
+            "progress must be callable, but is 5; pass a function of",
+        ),
+        (
+            lambda: inspect.unwrap(jf.interpolate)(GRID, throw="no"),
+            "throw must be True or False, but is 'no'",
+        ),
         (lambda: jf.fit_points(POINTS, BOUNDARY, degree=3), "degree is not an option .* pass order"),
         (lambda: jf.fit_points(POINTS, BOUNDARY, nett=3), "pass any of boundary, net, order, method, base"),
         (

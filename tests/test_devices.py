@@ -66,6 +66,9 @@ SENTENCES = {
     "insertion": "the method's insertion must be None where points are divided among devices, but is ",
     "loss": "the method's loss must be Tukey(scale) where points are divided among devices, but is ",
     "weights": "weights must not be negative and not all zero; ",
+    "number of weights": "weights must hold one number for each of the 20008 points, but has shape (20001,)",
+    "length of start": "start must hold a u and a v for each of the 20008 points, but their shapes are (80,)",
+    "start": "start v must lie in the domain [0, 1] of the base surface, but reaches from 0 to 5; ",
     "points": "points and weights must be finite, but 20008 points have an entry that is not; ",
 }
 

@@ -198,6 +198,7 @@ def test_parts_of_methods_that_are_no_objects_get_a_sentence():
     wrong += [
         ("GeometricApproximation", f"{x}='yes'") for x in ("fairing", "acceleration", "local", "single_step")
     ]
+    wrong += [("Fairing", "gamma='2'"), ("LevenbergMarquardt", "tolerance='x'")]
     lines = ["import jaxfit as jf"]
     for kind, part in wrong:
         lines += ["try:", f"    jf.{kind}({part})", "except TypeError as error:", "    print(error)"]

@@ -50,7 +50,7 @@ def laid_out(base):
     unit = unit_of(cloud)
     problem = make_problem(cloud, None, unit, Tolerances(*np.full(2, np.inf), np.int32(1)))
     net = jnp.asarray(unit.inward(base.control_points))
-    axes = WorkingSurface.of(net, base.knots_u, base.knots_v).on_device().axes
+    axes = jax.tree.map(jnp.asarray, WorkingSurface.of(net, base.knots_u, base.knots_v).axes)
     feet = jf.closest_point(jf.BSplineSurface(net, base.knots_u, base.knots_v), unit.inward(cloud))
     pad = problem.target.shape[1] - len(cloud)
     u, v = (jnp.pad(x, (0, pad)) for x in (feet.u, feet.v))
@@ -100,7 +100,7 @@ def test_second_derivatives_along_a_move_are_those_of_the_true_distances(base, l
     pad = problem.target.shape[1] - len(inside)
     feet_and_weight = (jnp.pad(x, (0, pad)) for x in (feet.u, feet.v, 1.0 * inside))
     move, along = np.random.default_rng(3).normal(size=(2, *net.shape))
-    axes = WorkingSurface.of(net, base.knots_u, base.knots_v).on_device().axes
+    axes = jax.tree.map(jnp.asarray, WorkingSurface.of(net, base.knots_u, base.knots_v).axes)
     pieces, moves = (pieces_on(x, *axes) for x in (net, jnp.asarray(move)))
     pull = jax.jit(second_order_rhs)(problem, pieces, moves, *feet_and_weight)
     ahead, here, behind = (distances(problem, net + h * move, base, feet) for h in (2e-4, 0.0, -2e-4))

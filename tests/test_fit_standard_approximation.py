@@ -1,5 +1,7 @@
 """Standard approximation: every round is the least-squares fit of (8), whatever solves it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -135,6 +137,13 @@ def test_without_parameter_correction_one_solve_is_the_fit(base, one):
     assert float(fit.average_error) <= float(fit.history.average[-1])
 
 
+def test_without_parameter_correction_the_stall_window_stays_as_given():
+    once = jf.StandardApproximation(parameter_correction=False)
+    assert (once.stall_window, once.stall_after) == (20, 1)
+    corrected = dataclasses.replace(once, parameter_correction=True)
+    assert (corrected.stall_window, corrected.stall_after) == (20, 20)
+
+
 def test_without_parameter_correction_errors_are_true_distances_inside_jit_too(base):
     method = jf.StandardApproximation(smoothing=SMOOTHING, parameter_correction=False)
     options = dict(tol_average=1e-6, max_steps=1)
@@ -180,6 +189,13 @@ def test_impossible_smoothing_gets_a_sentence(value):
 def test_a_solver_of_another_kind_gets_a_sentence():
     with pytest.raises(TypeError, match="solver must be an object"):
         jf.StandardApproximation(solver="cholesky")
+
+
+@pytest.mark.parametrize("solver", [jf.LevenbergMarquardt, jf.JaxoptGaussNewton, jf.JaxoptLevenbergMarquardt])
+@pytest.mark.parametrize("options", [{"tolerance": -1.0}, {"max_steps": 0}])
+def test_impossible_options_of_a_driver_get_a_sentence(solver, options):
+    with pytest.raises(ValueError, match=f"{next(iter(options))} must be a"):
+        solver(**options)
 
 
 def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):

@@ -158,3 +158,8 @@ def test_the_fit_differs_little_from_one_without_a_derivative(name):
     )
     assert float(followed.average_error) == pytest.approx(float(plain.average_error), rel=1e-3)
     assert followed.message == plain.message
+
+
+def test_a_negative_number_of_moves_gets_a_sentence():
+    with pytest.raises(ValueError, match="moves_followed must be a whole number of at least 0"):
+        jf.UnrolledAdjoint(moves_followed=-3)

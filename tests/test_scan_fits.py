@@ -8,6 +8,7 @@ import pytest
 from helpers import data, diagonal
 
 import jaxfit as jf
+from jaxfit._approximation._checked_scan import checked_scan
 from jaxfit._scan import is_nodata
 
 shapely = pytest.importorskip("shapely")
@@ -191,6 +192,25 @@ def test_a_drawn_cup_with_vertical_walls_needs_no_parameters():
 def test_wrong_arguments_get_a_sentence(change, error, sentence):
     with pytest.raises(error, match=sentence):
         jf.fit_points(**({"points": scan()} | change))
+
+
+class Table:
+    """Points as other libraries hold them: no array, but one on request."""
+
+    def __init__(self, points):
+        self.points = points
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.points, dtype)
+
+
+@pytest.mark.parametrize("kind", [Table, list, np.asarray])
+def test_gaps_are_seen_in_all_that_is_like_an_array(kind):
+    points = scan(20)
+    np.testing.assert_array_equal(checked_scan(kind(points), *4 * [None]).points, points)
+    points[3, 1] = np.nan
+    found = checked_scan(kind(points), *4 * [None]).points
+    np.testing.assert_array_equal(np.argwhere(np.isnan(found)), [[3, 1]])
 
 
 def test_faces_with_a_boundary_are_refused():

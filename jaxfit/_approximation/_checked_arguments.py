@@ -8,7 +8,15 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from jaxfit._approximation._errors import AbstractErrors
-from jaxfit._checks import as_floating, check_kind, check_number, check_steps, check_switch, is_concrete
+from jaxfit._checks import (
+    as_floating,
+    check_kind,
+    check_number,
+    check_progress,
+    check_steps,
+    check_switch,
+    is_concrete,
+)
 from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._scaling import Unit, unit_of
@@ -55,6 +63,7 @@ def check_options(
 ) -> None:
     """Raise unless the options of a fit are valid that say nothing about single points."""
     check_switch("throw", throw)
+    check_progress(progress)
     if hasattr(method, "check_normals"):  # which only methods for grids have
         name = type(method).__name__
         raise TypeError(
@@ -80,11 +89,6 @@ def check_options(
         raise ValueError(
             "tol_average and tol_maximum must not both be None, for every surface meets that; pass "
             "tol_average=0.0 to go on until the errors stop falling."
-        )
-    if progress is not None and not callable(progress):
-        raise TypeError(
-            f"progress must be callable, but is {progress!r}; pass a function of (step, max_steps, average, "
-            "maximum)."
         )
 
 
@@ -113,11 +117,17 @@ def checked_weights(weights: ArrayLike | None, count: int) -> Any:
             f"weights must hold one number for each of the {count} points, but has shape "
             f"{weight.shape}; give both the same length."
         )
-    if is_concrete(weight) and (np.asarray(weight).min() < 0 or not np.asarray(weight).any()):
+    if is_concrete(weight):
+        check_weight_range(np.asarray(weight).min(), np.asarray(weight).max())
+    return weight
+
+
+def check_weight_range(least: Any, most: Any) -> None:
+    """Raise unless the least and the greatest weight are those of weights that a fit can have."""
+    if least < 0 or not most > 0:
         raise ValueError(
             "weights must not be negative and not all zero; give each point a weight of 0 or more."
         )
-    return weight
 
 
 def checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
@@ -131,13 +141,17 @@ def checked_start(start: Any, count: int, domain: Any) -> tuple[Any, Any]:
             f"{u.shape} and {v.shape}; give one pair per point."
         )
     for name, x, limits in zip("uv", (u, v), domain or (), strict=False):
-        if not is_concrete(x, limits):
-            continue
-        low, high = (float(y) for y in limits)
-        slack = OUTSIDE * (high - low)
-        if np.asarray(x).min() < low - slack or np.asarray(x).max() > high + slack:
-            raise ValueError(
-                f"start {name} must lie in the domain [{low:g}, {high:g}] of the base surface, but reaches "
-                f"from {np.asarray(x).min():g} to {np.asarray(x).max():g}; give parameters on that surface."
-            )
+        if is_concrete(x, limits):
+            check_start_range(name, np.asarray(x).min(), np.asarray(x).max(), limits)
     return u, v
+
+
+def check_start_range(name: str, least: Any, most: Any, limits: Any) -> None:
+    """Raise unless feet from `least` to `most` lie within the `limits` of the domain."""
+    low, high = (float(y) for y in limits)
+    slack = OUTSIDE * (high - low)
+    if not (least >= low - slack and most <= high + slack):
+        raise ValueError(
+            f"start {name} must lie in the domain [{low:g}, {high:g}] of the base surface, but reaches "
+            f"from {least:g} to {most:g}; give parameters on that surface."
+        )

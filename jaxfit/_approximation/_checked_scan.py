@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
@@ -54,21 +53,27 @@ def checked_scan(points: Any, faces: Any, hole_length: Any, base: Any, start: An
 
 def _points_with_gaps(points: Any) -> np.ndarray:
     """Points (N, 3) of which some may be NaN or infinite."""
-    array = points
-    if isinstance(points, (list, tuple, np.ndarray, jax.Array)) and not np.ma.isMaskedArray(points):
-        try:
-            array = np.asarray(points)
-        except ValueError:
-            array = points  # rows that differ in length: `as_points` says so
-    gaps = np.zeros(np.shape(array) if isinstance(array, np.ndarray) else (), bool)
-    if isinstance(array, np.ndarray) and array.dtype.kind == "f":
-        gaps = ~np.isfinite(array)
-        array = np.where(gaps, 0.0, array)
+    array, gaps = points, None
+    if (numbers := _as_numbers(points)) is not None:
+        gaps = ~np.isfinite(numbers)
+        array = np.where(gaps, 0, numbers)
     typed = as_points("points", array, 3, least=LEAST_POINTS)
-    if (whole := ~gaps.any(axis=-1)).any():
-        unit_of(typed[whole])  # which looks at their precision
+    whole = slice(None) if gaps is None else ~gaps.any(axis=1)
+    if len(some := typed[whole]):
+        unit_of(some)  # which looks at their precision
     checked = np.asarray(typed, float)
-    return np.where(gaps, np.nan, checked) if gaps.any() else checked
+    return checked if gaps is None else np.where(gaps, np.nan, checked)
+
+
+def _as_numbers(points: Any) -> np.ndarray | None:
+    """Points as an array of numbers, or None where `as_points` says what they are."""
+    if np.ma.isMaskedArray(points):
+        return None
+    try:
+        array = np.asarray(points)
+    except ValueError:  # rows that differ in length
+        return None
+    return array if array.dtype.kind in "fiub" else None
 
 
 def _checked_faces(faces: Any, count: int) -> np.ndarray:

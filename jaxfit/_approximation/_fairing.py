@@ -1,11 +1,11 @@
 """`Fairing`: smoothing of a control net between iterations (section 4.3 of the paper)."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
+
+from jaxfit._checks import check_number
 
 
 class Fairing(eqx.Module):
@@ -41,10 +41,8 @@ class Fairing(eqx.Module):
     gamma: float = 2.0
 
     def __check_init__(self) -> None:
-        if isinstance(self.every, bool) or not isinstance(self.every, int) or self.every < 1:
-            raise ValueError(f"every must be a whole number of at least 1, but is {self.every!r}; give one.")
-        if not 0 <= self.gamma < math.inf:
-            raise ValueError(f"gamma must be finite and at least 0, but is {self.gamma!r}; 2 is usual.")
+        check_number("every", self.every, 1, whole=True)
+        check_number("gamma", self.gamma, 0.0)
 
     def __call__(self, net: Float[Array, "nu nv d"], held: Bool[Array, "nu nv"]) -> Float[Array, "nu nv d"]:
         """The faired net; its border and `held` control points do not move."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._least_squares import AbstractLeastSquares, LeastSquaresProblem
+from jaxfit._approximation._least_squares import AbstractLeastSquares, LeastSquaresProblem, check_driver
 
 
 class JaxoptGaussNewton(AbstractLeastSquares):
@@ -24,8 +24,8 @@ class JaxoptGaussNewton(AbstractLeastSquares):
 
     Raises
     ------
-    ModuleNotFoundError
-        When a fit uses it and `jaxopt` is not installed.
+    ValueError
+        If `tolerance` is negative or not finite, or `max_steps` no whole number of at least 1.
 
     Examples
     --------
@@ -35,6 +35,9 @@ class JaxoptGaussNewton(AbstractLeastSquares):
 
     tolerance: float = 1e-10
     max_steps: int = 20
+
+    def __check_init__(self) -> None:
+        check_driver(self)
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """Run jaxopt's driver."""
@@ -53,8 +56,8 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
 
     Raises
     ------
-    ModuleNotFoundError
-        When a fit uses it and `jaxopt` is not installed.
+    ValueError
+        If `tolerance` is negative or not finite, or `max_steps` no whole number of at least 1.
 
     Examples
     --------
@@ -64,6 +67,9 @@ class JaxoptLevenbergMarquardt(AbstractLeastSquares):
 
     tolerance: float = 1e-11
     max_steps: int = 60
+
+    def __check_init__(self) -> None:
+        check_driver(self)
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """Run jaxopt's driver."""

@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._barrier import materialise
+from jaxfit._checks import check_number
 from jaxfit._normal_equations import NormalOperator, RegularisedSystem, Stencil, free_points, normal_solver
 from jaxfit._varying import varying_axes
 
@@ -92,6 +93,11 @@ class LevenbergMarquardt(AbstractLeastSquares):
     max_steps : int
         The largest number of steps (default 60).
 
+    Raises
+    ------
+    ValueError
+        If `tolerance` is negative or not finite, or `max_steps` no whole number of at least 1.
+
     Examples
     --------
     >>> jf.StandardApproximation(solver=jf.LevenbergMarquardt()).solver.max_steps
@@ -100,6 +106,9 @@ class LevenbergMarquardt(AbstractLeastSquares):
 
     tolerance: float = 1e-10
     max_steps: int = 60
+
+    def __check_init__(self) -> None:
+        check_driver(self)
 
     def __call__(self, problem: LeastSquaresProblem) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
         """Run optimistix's driver."""
@@ -111,6 +120,12 @@ class LevenbergMarquardt(AbstractLeastSquares):
         solver: Any = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=linear)
         net = _solution(solver, problem, self.max_steps).value
         return _free_part(problem, net), jnp.zeros((), net.dtype)
+
+
+def check_driver(solver: Any) -> None:
+    """Raise unless the options that iterative drivers have in common are valid."""
+    check_number("tolerance", solver.tolerance, 0.0)
+    check_number("max_steps", solver.max_steps, 1, whole=True)
 
 
 def _solution(solver: Any, problem: LeastSquaresProblem, steps: int) -> Any:

@@ -15,7 +15,13 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxfit._approximation._checked_arguments import check_options, checked_start
+from jaxfit._approximation._checked_arguments import (
+    check_options,
+    check_start_range,
+    check_weight_range,
+    checked_start,
+    checked_weights,
+)
 from jaxfit._approximation._cloud_fit import (
     LEAST_POINTS,
     final_code,
@@ -60,11 +66,11 @@ def fit_sharded_cloud(
 ) -> Fit:
     """`approximate` of points divided among devices, its options in a dictionary."""
     summed = _checked_method(points, base, method, request)
+    weights, start = _checked_rows(points, base, request["weights"], request["start"])
     mesh, axis = divided_over(points)  # type: ignore[misc]
-    weights = np.ones(points.shape[0]) if request["weights"] is None else request["weights"]
     weights = jax.device_put(weights, NamedSharding(mesh, P(axis)))
     unit = _checked_unit(mesh, axis, points, weights)
-    feet = _first_feet(points, base, request["start"])
+    feet = _first_feet(points, base, start)
     tolerances = tolerances_of(request["tol_average"], request["tol_maximum"], request["max_steps"])
     begun = working_surface(base, unit, True)
     (u, v, error, converged), end = run_on_devices(
@@ -116,23 +122,35 @@ def _checked_method(
     return by_sums(method, ON_DEVICES, WHERE)
 
 
+def _checked_rows(points: jax.Array, base: BSplineSurface, weights: Any, start: Any) -> tuple[Any, Any]:
+    """Weights, and the feet to start from or None; of what is divided only the shapes have been checked."""
+    count = points.shape[0]
+    if weights is None:
+        weights = np.ones(count)
+    elif divided_over(weights) is None:
+        weights = checked_weights(weights, count)
+    else:
+        weights = weights.astype(jax.eval_shape(lambda x: checked_weights(x, count), weights).dtype)
+    if _are_divided(start):
+        jax.eval_shape(lambda *x: checked_start(x, count, base.domain), *start)
+    elif start is not None:
+        start = checked_start(start, count, base.domain)
+    return weights, start
+
+
+def _are_divided(start: Any) -> bool:
+    return isinstance(start, (tuple, list)) and all(divided_over(x) is not None for x in start)
+
+
 def _checked_unit(mesh: Mesh, axis: MeshAxis, points: jax.Array, weights: jax.Array) -> Unit:
     """The unit of the points of positive weight; raises unless all numbers are valid."""
-    if weights.shape != points.shape[:1]:
-        raise ValueError(
-            f"weights must hold one number for each of the {points.shape[0]} points, but has shape "
-            f"{weights.shape}; give both the same length."
-        )
     bad, box, least, most = (np.asarray(x) for x in _extent(mesh, axis, points, weights))
     if bad:
         raise ValueError(
             f"points and weights must be finite, but {int(bad)} points have an entry that is not; remove or "
             "repair them."
         )
-    if least < 0 or not most > 0:
-        raise ValueError(
-            "weights must not be negative and not all zero; give each point a weight of 0 or more."
-        )
+    check_weight_range(least, most)
     return unit_of(np.stack([box[0], -box[1]]), "points")
 
 
@@ -153,13 +171,22 @@ def _extent(mesh: Mesh, axis: MeshAxis, points: Array, weights: Array) -> tuple[
 def _first_feet(points: jax.Array, base: BSplineSurface, start: Any) -> tuple[jax.Array, jax.Array]:
     """The feet to start from: those given, or each process finds the closest points of its own."""
     if start is not None:
-        whole = any(divided_over(x) is None for x in start)
-        u, v = checked_start(start, points.shape[0], base.domain) if whole else start
+        u, v = start
+        if _are_divided(start):
+            ends = np.asarray(_ends(u, v))
+            for name, (least, most), limits in zip("uv", ends, base.domain, strict=True):
+                check_start_range(name, least, most, limits)
         sharding = NamedSharding(points.sharding.mesh, P(points.sharding.spec[0]))  # type: ignore[attr-defined]
         return jax.device_put(u, sharding), jax.device_put(v, sharding)
     nearest = closest_point(base, local_rows(points))
     u, v = (with_local_rows(np.asarray(x, working_dtype()), points) for x in (nearest.u, nearest.v))
     return u, v
+
+
+@compiled
+def _ends(u: Array, v: Array) -> Array:
+    """The least and the greatest u, and v."""
+    return jnp.stack([jnp.stack([jnp.min(x), jnp.max(x)]) for x in (u, v)])
 
 
 @partial(compiled, static_argnums=(0, 1, 2, 3))

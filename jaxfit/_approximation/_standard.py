@@ -57,7 +57,8 @@ class StandardApproximation(AbstractIterativeMethod):
         chooses lambda from the data before the iteration begins.
     parameter_correction : bool
         Whether parameters are corrected (default True). False solves once, at the parameters given as `start`
-        or found on the base surface, and the history records errors at these parameters.
+        or found on the base surface, whatever `stall_window` is, and the history records errors at these
+        parameters.
     border : FixedBorder(), FixedCorners(), FreeBorder() or FixedSides(...)
         Which control points on the border of the net stay (default all of them, section 2.3).
     solver : GaussNewton(), LevenbergMarquardt(), JaxoptGaussNewton() or JaxoptLevenbergMarquardt()
@@ -104,10 +105,6 @@ class StandardApproximation(AbstractIterativeMethod):
     stall_window: int = 20
     stall_gain: Scalar = 2e-3
 
-    def __post_init__(self) -> None:
-        if not self.parameter_correction:
-            self.stall_window = 1  # a second solve would give the same
-
     def __check_init__(self) -> None:
         check_kind("solver", self.solver, AbstractLeastSquares, "GaussNewton()")
         if not isinstance(self.smoothing, AbstractSmoothing):
@@ -122,6 +119,11 @@ class StandardApproximation(AbstractIterativeMethod):
     def finds_feet(self) -> bool:
         """Whether parameters are corrected: they are then those of foot points."""
         return self.parameter_correction
+
+    @property
+    def stall_after(self) -> int:
+        """The field, or 1 for parameters that are kept: a second solve would give the same."""
+        return self.stall_window if self.parameter_correction else 1
 
     @property
     def stall_since(self) -> int:

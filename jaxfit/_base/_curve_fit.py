@@ -72,7 +72,7 @@ def fit_curves(
     """
     points = _power_of_two(max(len(s.points) for s in starts), 256)
     capacity = _power_of_two(max(max(len(s.control), len(s.new_knots)) for s in starts), 64)
-    padded = [_padded(s, order, points, capacity) for s in starts]
+    padded = [_padded(s, points, capacity) for s in starts]
     arrays = [jnp.asarray(np.stack(x).astype(dtype)) for x in zip(*padded, strict=True)]
     problem, feet, control = _Problem(*arrays[:5]), arrays[5], arrays[6]
     limit = jnp.asarray(np.asarray(tolerance, dtype))
@@ -86,7 +86,7 @@ def _power_of_two(count: int, least: int) -> int:
     return max(least, 1 << (count - 1).bit_length())
 
 
-def _padded(start: CurveStart, order: int, points: int, capacity: int) -> tuple[np.ndarray, ...]:
+def _padded(start: CurveStart, points: int, capacity: int) -> tuple[np.ndarray, ...]:
     spare, count = points - len(start.points), len(start.control)
     weights = np.concatenate([np.ones(len(start.points)), np.zeros(spare)])
     free = np.zeros((capacity, 1))

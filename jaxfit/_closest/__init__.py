@@ -6,6 +6,7 @@ from jaxfit._closest._closest_point import closest_point as closest_point
 from jaxfit._closest._foot_methods import AbstractFootMethod as AbstractFootMethod
 from jaxfit._closest._foot_methods import HuWallner as HuWallner
 from jaxfit._closest._foot_methods import Newton as Newton
+from jaxfit._closest._foot_update import FOOT_STEPS as FOOT_STEPS
 from jaxfit._closest._foot_update import FootUpdate as FootUpdate
 from jaxfit._closest._foot_update import update_feet as update_feet
 from jaxfit._closest._forms import dot as dot

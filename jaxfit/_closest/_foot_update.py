@@ -16,7 +16,7 @@ from jaxfit._precision import default_foot_tolerance
 from jaxfit._splines._pieces import Pieces
 from jaxfit._unrolling import unrolled
 
-MAX_STEPS = 40
+FOOT_STEPS = 40  # evaluations of the surface, after which a foot is not found
 
 
 class FootUpdate(eqx.Module):
@@ -38,7 +38,7 @@ def update_feet(
     tolerance: Float[Array, ""],
     *,
     idle: Bool[Array, " points"],
-    max_steps: Any = MAX_STEPS,
+    max_steps: Any = FOOT_STEPS,
     single_step: Any = False,
     within: ParameterBounds | None = None,
     sums: PointSums | None = None,

@@ -42,7 +42,7 @@ def samples_per_cell(cells: int, across: int) -> int:
 
 def sample(net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Samples:
     """Sample every cell evenly, with bounds (concrete). Creases are sampled on both sides."""
-    u, v, count_u, count_v = _parameters(net, axis_u, axis_v)
+    u, v, count_u, count_v = _parameters(axis_u, axis_v)
     cell_u, cell_v = axis_u.locate(u), axis_v.locate(v)
     jet: Any = grid_jet(net, (axis_u, axis_v), (u, v), (cell_u, cell_v), 2).transpose(1, 2, 0, 3, 4)
     points = np.ascontiguousarray(jet[0, 0].transpose(0, 2, 1))
@@ -54,12 +54,12 @@ def sample(net: Float[np.ndarray, "nu nv d"], axis_u: Axis, axis_v: Axis) -> Sam
 
 def sample_points(net: Any, axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, Any]:
     """Parameters u (a,) and v (b,), and the points there (a, b, d)."""
-    u, v, _, _ = _parameters(net, axis_u, axis_v)
+    u, v, _, _ = _parameters(axis_u, axis_v)
     jet = grid_jet(net, (axis_u, axis_v), (u, v), (axis_u.locate(u), axis_v.locate(v)), 0)
     return u, v, jet[:, 0, 0].swapaxes(1, 2)
 
 
-def _parameters(net: Any, axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, int, int]:
+def _parameters(axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, int, int]:
     """Parameters of the samples, and how many a cell has in each direction."""
     flat = axis_v.polynomials.shape[1] == 1  # a curve: nothing happens along v
     count_u = CURVE_SAMPLES if flat else samples_per_cell(axis_u.cells, axis_v.cells)

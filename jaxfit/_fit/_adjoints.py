@@ -48,6 +48,11 @@ class UnrolledAdjoint(AbstractAdjoint):
         approximation is followed through all its iterations, of which reverse mode runs each three times and
         keeps about `max_steps` / 16 + 16 states with the feet of all points.
 
+    Raises
+    ------
+    ValueError
+        If `moves_followed` is no whole number of at least 0.
+
     Notes
     -----
     Source: the derivative of equations (13) and (14) of Kineri, Wang, Lin and Maekawa (2012), and of the
@@ -63,6 +68,10 @@ class UnrolledAdjoint(AbstractAdjoint):
     """
 
     moves_followed: int | None = None
+
+    def __check_init__(self) -> None:
+        if self.moves_followed is not None:
+            check_number("moves_followed", self.moves_followed, 0, whole=True)
 
     def moves(self, freeze_after: int | None) -> int:
         """As told, or as many as move feet."""

@@ -6,12 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfit._closest import AbstractFootMethod, ParameterBounds, project, update_feet
+from jaxfit._closest import FOOT_STEPS, AbstractFootMethod, ParameterBounds, project, update_feet
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._splines._pieces import Axis, Pieces
-
-FOOT_STEPS = 40
 
 
 def measure_feet(

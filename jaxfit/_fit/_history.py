@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -135,13 +136,7 @@ def public_history(history: ErrorHistory, last_step: Any, fairing: Any = None) -
     net = counts[1:].T
     refined = xp.any(net > xp.concatenate([net[:1], net[:-1]]), axis=1)
     parts = [*errors, counts[0], net, xp.asarray(faired), refined]
-    return History(*(jnp.asarray(x) for x in parts)) if not concrete else _device(parts)
-
-
-def _device(parts: list[Any]) -> History:
-    import jax
-
-    return History(*jax.device_put(parts))
+    return History(*(jax.device_put(parts) if concrete else (jnp.asarray(x) for x in parts)))
 
 
 def without_counts(history: History) -> History:

@@ -209,7 +209,7 @@ def _decide(
     finite = jnp.isfinite(maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
     sound = finite & (average <= 1.0 + MAX_GROWTH * history.first)
     met = (average <= goal.average) & (maximum <= goal.maximum)
-    stalled = history.is_stalled(step, method.stall_window, method.stall_gain, method.stall_since)
+    stalled = history.is_stalled(step, method.stall_after, method.stall_gain, method.stall_since)
     outcomes = (
         (~sound, RESULTS.diverged),
         (met, RESULTS.converged),

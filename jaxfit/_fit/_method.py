@@ -71,7 +71,7 @@ class AbstractIterativeMethod(eqx.Module):
     use `jnp.where` and `lax.cond` instead of `if`.
 
     A method is an `equinox.Module`, and its fields are its options. Fields that are Python floats are traced,
-    so that another value compiles nothing; all other fields are static and must be hashable. The two
+    so that another value compiles nothing; all other fields are static and must be hashable. The
     properties below may be plain class attributes, as in `stall_since = 0`.
 
     Attributes
@@ -92,6 +92,11 @@ class AbstractIterativeMethod(eqx.Module):
 
     stall_window: eqx.AbstractVar[int]
     stall_gain: eqx.AbstractVar[Scalar]
+
+    @property
+    def stall_after(self) -> int:
+        """The window that the loop sees: the field `stall_window`, unless the method knows better."""
+        return self.stall_window
 
     @property
     @abstractmethod

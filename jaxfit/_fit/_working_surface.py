@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -95,7 +94,3 @@ class WorkingSurface(eqx.Module):
         order_u, order_v = self.order
         net, knots_u, knots_v = (np.asarray(x) for x in (self.control_points, self.knots_u, self.knots_v))
         return WorkingSurface.of(net[:nu, :nv], knots_u[: nu + order_u], knots_v[: nv + order_v])
-
-    def on_device(self) -> "WorkingSurface":
-        """The surface as JAX arrays."""
-        return jax.tree.map(jnp.asarray, self)

@@ -12,7 +12,9 @@ from jaxfit._checks import (
     check_kind,
     check_number,
     check_order,
+    check_progress,
     check_steps,
+    check_switch,
     eager_where_concrete,
     has_coordinates_first,
     is_concrete,
@@ -100,6 +102,8 @@ def interpolate(
     >>> bool(np.allclose(fit.surface(fit.u, fit.v), grid, atol=1e-5))
     True
     """
+    check_switch("throw", throw)
+    check_progress(progress)
     check_order(order)
     check_steps("max_steps", max_steps)
     if tolerance is not None:

@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._closest import Newton, project
-from jaxfit._fit._feet import FOOT_STEPS
+from jaxfit._closest import FOOT_STEPS, Newton, project
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._interpolation._gmres import GmresLimits, append_errors, distances, gmres_solve
 from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
