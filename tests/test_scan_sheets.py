@@ -86,6 +86,29 @@ def test_points_strewn_about_a_sheet_are_outliers(count, size):
     assert (found.kept >= 5000).sum() <= 0.1 * count
 
 
+def test_points_at_a_wrong_level_are_no_second_sheet():
+    """They are few, if far apart: their triangles are as large as the sheet."""
+    x, y = np.random.default_rng(0).uniform(0, 1, (2, 2400))
+    points = np.stack([x, y, 1 + 0.1 * np.sin(4 * x)], axis=1)
+    points[:48, 2] = 0.0
+    sheet = sheet_of(points)
+    assert sheet.counts["off_the_sheet"] == 48
+    assert not sheet.on_sheet[:48].any()
+    assert sheet.area == pytest.approx(1.04, rel=0.04)
+
+
+def test_points_that_do_not_count_have_no_say_in_the_sheet():
+    points = square(24)
+    above = points[::3] + 0.1 * np.eye(3)[2]
+    counted = np.arange(len(points) + len(above)) < len(points)
+    sheet = sheet_of(np.concatenate([points, above]), counted=counted)
+    alone = sheet_of(points)
+    np.testing.assert_array_equal(sheet.faces, alone.faces)
+    assert sheet.area == alone.area
+    assert len(sheet.nearest) == len(counted)
+    assert sheet.counts["non_finite"] == 0
+
+
 def test_no_point_is_an_outlier_where_a_sheet_turns_sparse():
     """Half a cylinder of 20,000 points, a tenth of it a hundred times as dense."""
     x, y = np.random.default_rng(4).random((2, 20_000))

@@ -32,9 +32,9 @@ def fit_scan(
 ) -> Fit:
     """The fit of the points on the sheet; all others get weight 0, and NaN where they are not finite."""
     points = scan.points
-    sheet = sheet_of(points, scan.faces, scan.hole_length)
     finite = np.isfinite(points).all(axis=1)
     given = np.ones(len(points)) if request["weights"] is None else np.asarray(request["weights"], float)
+    sheet = sheet_of(points, scan.faces, scan.hole_length, given > 0)
     weights = np.zeros(len(points))
     on_sheet = sheet.number[sheet.on_sheet]
     weights[on_sheet] = given[on_sheet]

@@ -114,9 +114,9 @@ def polished(
 
         done = good & ((new.size <= least) | (now.steps >= most))
         trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
-        kept = jax.tree.map(lambda x, y: jnp.where(good, x, y), (new, system), (old, now.system))
+        new, system = jax.tree.map(lambda x, y: jnp.where(good, x, y), (new, system), (old, now.system))
         ended = done | (shift > MOST_SHIFT)
-        return _State(*kept, trial, predicted, shift, now.steps + good, ~good, yes, ended)
+        return _State(new, system, trial, predicted, shift, now.steps + good, ~good, yes, ended)
 
     nothing, yes = jnp.zeros((), still.dtype), jnp.asarray(True)
     first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)

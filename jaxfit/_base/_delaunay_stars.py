@@ -24,6 +24,7 @@ WIDEST = np.deg2rad(150.0)  # a gap between neighbours counts as no wider than t
 # still free. Less than that has a triangle, if a thin one, as on scan lines.
 ACROSS = (100, WIDEST), (1000, np.pi)
 ENTRIES = 1 << 20  # of arrays at once, in the search for these
+SECTORS = 180  # of the circle, of which many neighbours are the nearest
 
 
 class Stars(NamedTuple):
@@ -80,11 +81,26 @@ def _stars_among(
 ) -> Stars:
     """The stars of the points `rows` among given ones."""
     plane = _in_tangent_planes(planes, rows, members, filled)
-    angle = np.where(filled, np.arctan2(plane[..., 1], plane[..., 0]), np.inf)
+    angle = np.arctan2(plane[..., 1], plane[..., 0])
+    if members.shape[1] > SECTORS:
+        filled = filled & _nearest_in_sector(angle, _norm(plane), filled)
+    angle = np.where(filled, angle, np.inf)
     order = np.argsort(angle, axis=1, kind="stable")
     members, filled, plane = _reordered((members, filled, plane), order)
     members, filled, plane = _hulls(members, filled, plane, straight)
     return Stars(members, filled, plane, _angles_between(plane, filled))
+
+
+def _nearest_in_sector(angle: np.ndarray, far: np.ndarray, filled: np.ndarray) -> np.ndarray:
+    """Which neighbours are nearest in their sector. Along lines hundreds are in convex position when they are
+    inverted, and most in hardly different directions.
+    """
+    sector = np.floor((angle + np.pi) * (SECTORS / (2 * np.pi)))
+    order = np.lexsort((far, np.where(filled, sector, np.inf)), axis=1)
+    first = np.diff(np.take_along_axis(sector, order, axis=1), axis=1, prepend=-1.0) != 0
+    nearest = np.zeros_like(filled)
+    np.put_along_axis(nearest, order, first, axis=1)
+    return nearest
 
 
 def _with_nearest(
@@ -206,11 +222,12 @@ def _reordered(arrays: tuple[np.ndarray, ...], order: np.ndarray) -> list[np.nda
 def _hulls(
     members: np.ndarray, filled: np.ndarray, plane: np.ndarray, straight: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop the neighbours that are no Delaunay neighbours."""
+    """Drop the neighbours that are no Delaunay neighbours. Those that are filled come first."""
     flipped = _inverted(plane)
     rows = np.arange(len(members))  # those in which something was dropped last time
     while len(rows):
-        part, there = flipped[rows], filled[rows]
+        most = int(filled[rows].sum(axis=1).max())  # soon much less than the width
+        part, there = flipped[rows, :most], filled[rows, :most]
         before, after = cyclic_neighbours(part, there)
         turn = _cross(part - before, after - part)
         size = _norm(part - before) * _norm(after - part)
@@ -223,8 +240,9 @@ def _hulls(
         changed = dropped.any(axis=1)
         rows, there = rows[changed], (there & ~dropped)[changed]
         order = np.argsort(~there, axis=1, kind="stable")
-        parts = _reordered((members[rows], there, plane[rows], flipped[rows]), order)
-        members[rows], filled[rows], plane[rows], flipped[rows] = parts
+        filled[rows, :most] = np.take_along_axis(there, order, axis=1)
+        for x in (members, plane, flipped):
+            x[rows, :most] = _reordered((x[rows, :most],), order)[0]
     width = int(filled.sum(axis=1).max())
     return members[:, :width], filled[:, :width], plane[:, :width]
 

@@ -59,12 +59,18 @@ class Layout(NamedTuple):
 
 
 def sheet_of(
-    points: Float[Any, "points 3"], faces: Faces | None = None, hole_length: float | None = None
+    points: Float[Any, "points 3"],
+    faces: Faces | None = None,
+    hole_length: float | None = None,
+    counted: Bool[np.ndarray, " points"] | None = None,
 ) -> Sheet:
-    """Clean the points, connect them, and lay the sheet out in the unit square."""
+    """Clean the points, connect them, and lay the sheet out in the unit square; points that are not `counted`
+    have no say.
+    """
     import_shapely()  # a missing extra is to be said first
     doing("cleaning the points")
-    clean = cleaned(points)
+    finite = np.isfinite(points).all(axis=1)
+    clean = cleaned(points if counted is None else np.where(counted[:, None], points, np.nan))
     if len(clean.kept) < LEAST_POINTS:
         raise ValueError(
             f"points must hold at least {LEAST_POINTS} distinct and finite points without a boundary, but "
@@ -83,14 +89,14 @@ def sheet_of(
     places = np.clip(mesh.places @ rectangle.axes.T - rectangle.corner, 0.0, rectangle.sides)
     counts = {
         "points_read": len(points),
-        "non_finite": clean.non_finite,
+        "non_finite": int((~finite).sum()),
         "duplicates": clean.duplicates,
         "outliers": clean.outliers,
         "off_the_sheet": int((~on_sheet).sum()),
     }
     flat = mesh.flat @ rectangle.axes.T - rectangle.corner
     densities = knot_densities(mesh.nodes, mesh.faces, flat, rectangle.sides)
-    nearest = _nearest((points[np.isfinite(points).all(axis=1)] - centre) / size, cloud)
+    nearest = _nearest((points[finite] - centre) / size, cloud)
     spacing = float(np.median(np.concatenate([_steps(mesh.nodes[x]) for x in mesh.loops])))
     return Sheet(
         points=cloud,
@@ -139,9 +145,9 @@ def _given_faces(points: np.ndarray, clean: Cleaned, faces: Faces | None) -> Fac
     numbers = place[inverse[faces]]
     whole = (numbers >= 0).all(axis=1) & (np.diff(np.sort(numbers, axis=1), axis=1) > 0).all(axis=1)
     found = manifold(numbers[whole])
-    if len(found) < COVERED * len(faces):
+    if len(found) < COVERED * whole.sum():
         raise ValueError(
             f"faces must make a surface whose triangles run round the same way, but only {len(found)} of "
-            f"{len(faces)} do; turn them alike, or leave faces out."
+            f"{whole.sum()} do; turn them alike, or leave faces out."
         )
     return found

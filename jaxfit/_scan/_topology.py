@@ -17,6 +17,7 @@ from jaxfit._scan._manifold import (
 )
 
 COMPARABLE = 0.1  # of the area of the largest piece: a second one is no stray
+FEW = 0.05  # of the triangles of the piece that has most
 LEAST_OPENING = 0.1  # of the perimeter of a flat disc of this area: a shorter rim is a gap in a sphere
 TUBE_ENDS = 0.5  # least ratio of the areas of two loops that may be the ends of a tube
 TUBE_AREA = 2.0  # least area of a tube, times the difference of these
@@ -28,14 +29,18 @@ class RoughError(ValueError):
 
 
 def largest_piece(points: Float[Any, "points 3"], faces: Faces) -> Faces:
-    """The triangles of the largest piece; raises ValueError if there is another of comparable size."""
+    """The triangles of the largest piece; raises ValueError if there is another of comparable size.
+
+    Pieces of few triangles count for nothing, however large these are: some points at a wrong level.
+    """
     if not len(faces):
         raise ValueError(
             "points must be dense enough to tell their neighbours, but no triangles could be made of them; "
             "give more points, or a boundary."
         )
     piece = pieces(faces)
-    area = np.bincount(piece, areas(points, faces))
+    many = np.bincount(piece) > FEW * np.bincount(piece).max()
+    area = np.where(many, np.bincount(piece, areas(points, faces)), 0.0)
     largest = int(np.argmax(area))
     second = float(np.sort(area)[-2]) if len(area) > 1 else 0.0
     if second > COMPARABLE * area[largest]:
