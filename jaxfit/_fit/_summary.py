@@ -220,7 +220,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         return sentence
     where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
     kind = "grid" if not _is_of_cloud(fit) else "cloud" if fit.trimmed is None else "scan"
-    folds = f"the surface folds at {where}: {_REMEDIES[kind]}."
+    other = "; if so, try StandardInterpolation()" if not fit.stats.get("solved", True) else ""
+    folds = f"the surface folds at {where}: {_REMEDIES[kind]}{other}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"
