@@ -111,7 +111,9 @@ def _add_batch(commands: Any) -> None:
 def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     """What a single fit and each of many can be told."""
     parser.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
-    parser.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
+    parser.add_argument(
+        "--order", type=_order, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4); 3 is 3x3"
+    )
     add_method_options(parser)
     parser.add_argument(
         "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
@@ -149,6 +151,10 @@ def _pair(text: str) -> tuple[int, int]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is no pair of counts such as 8x6")
     return int(match[1]), int(match[2])
+
+
+def _order(text: str) -> tuple[int, int]:
+    return (int(text), int(text)) if re.fullmatch(r"\d", text, re.ASCII) else _pair(text)
 
 
 def _percent(text: str) -> float:

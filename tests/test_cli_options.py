@@ -143,6 +143,8 @@ def test_options_arrive_as_fractions(fits, folder):
         "tolerance": pytest.approx(1e-4),
         "progress": None,
     }
+    assert run("cloud.npz", "--order", "3") == 0
+    assert fits.made[2][3]["order"] == (3, 3)
 
 
 def test_points_without_boundary_are_fitted_without(fits, folder):

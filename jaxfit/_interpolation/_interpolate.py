@@ -11,8 +11,8 @@ from jaxfit._checks import (
     as_floating,
     check_kind,
     check_number,
-    check_order,
     check_steps,
+    checked_order,
     eager_where_concrete,
     has_coordinates_first,
     is_concrete,
@@ -34,7 +34,7 @@ METHODS = "GeometricInterpolation(), StandardInterpolation() or NormalInterpolat
 def interpolate(
     grid: Any,
     method: AbstractInterpolation | None = None,
-    order: tuple[int, int] = (4, 4),
+    order: int | tuple[int, int] = (4, 4),
     tolerance: ArrayLike | None = None,
     max_steps: int = 1000,
     progress: Progress | None = None,
@@ -53,8 +53,8 @@ def interpolate(
     method : GeometricInterpolation(), StandardInterpolation() or NormalInterpolation(), optional
         Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals: it alone meets
         them, and needs them.
-    order : (K, L)
-        Degree + 1 along the first and the second index, each 2 to 8.
+    order : (K, L) or int
+        Degree + 1 along the first and the second index, each 2 to 8; one number is that of both.
     tolerance : float, optional
         The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
         1e-12 in float64, 2e-6 in float32, and more where the data is so far from the origin that rounding its
@@ -100,7 +100,7 @@ def interpolate(
     >>> bool(np.allclose(fit.surface(fit.u, fit.v), grid, atol=1e-5))
     True
     """
-    check_order(order)
+    order = checked_order(order)
     check_steps("max_steps", max_steps)
     if tolerance is not None:
         check_number("tolerance", tolerance, 0.0)
@@ -125,7 +125,7 @@ def _scaled(data: Any, normals: Any, order: tuple[int, int], tolerance: Any, max
     if normals is not None:
         normals = np.asarray(normals, dtype) if is_concrete(normals) else normals.astype(dtype)
     frame = Frame(unit.within(dtype), corners, diagonal, goal, tolerance, np.int32(max_steps))
-    return GridProblem(inner, normals, frame, unit, (int(order[0]), int(order[1])))
+    return GridProblem(inner, normals, frame, unit, order)
 
 
 def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
@@ -142,7 +142,7 @@ def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
         first = has_coordinates_first(data.shape)
         advice = "pass np.moveaxis(grid, 0, -1)" if first else "give more points or lower the order"
         raise ValueError(
-            f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
+            f"grid must have at least {order[0]} x {order[1]} points for order {order}, but has "
             f"shape {data.shape}; {advice}."
         )
     if not is_concrete(data):
