@@ -59,6 +59,15 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see {self.prog} --help.")
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Name the command whose help lists what it takes, where there is an argument that it does not."""
+        known, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            raise InputError(
+                f"unrecognized arguments: {' '.join(unknown)}; see {self.prog} {known.command} --help."
+            )
+        return known
+
 
 def argument_parser() -> argparse.ArgumentParser:
     """The parser of `jaxfit`; what it cannot read raises `InputError`."""
