@@ -56,6 +56,11 @@ def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
     return at_once
 
 
+def said_missing(path: str | os.PathLike) -> str:
+    """The sentence for a file that is not there."""
+    return f"{os.fspath(path)} does not exist; check its name and folder."
+
+
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
     array: Any = x
