@@ -57,6 +57,11 @@ def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
     return at_once
 
 
+def said_missing(path: str | os.PathLike) -> str:
+    """The sentence for a file that is not there."""
+    return f"{os.fspath(path)} does not exist; check its name and folder."
+
+
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
     array: Any = x
@@ -301,11 +306,13 @@ def check_steps(name: str, value: Any) -> None:
     check_number(name, value, 0, whole=True)
 
 
-def check_order(order: Any) -> None:
-    """Raise unless `order` is a pair of whole numbers from 2 to 8."""
-    pair = isinstance(order, (tuple, list)) and len(order) == 2
-    if not pair or not all(isinstance(k, (int, np.integer)) and 2 <= k <= 8 for k in order):
+def checked_order(order: Any) -> tuple[int, int]:
+    """`order` as a pair, whose numbers are equal where one is given; raises unless they are from 2 to 8."""
+    pair = (order, order) if isinstance(order, (int, np.integer)) else order
+    whole = isinstance(pair, (tuple, list)) and all(isinstance(k, (int, np.integer)) for k in pair)
+    if not whole or len(pair) != 2 or not all(2 <= k <= 8 for k in pair):
         raise ValueError(
-            f"order must be a pair (K, L) of whole numbers from 2 to 8, but is {order!r}; pass for instance "
-            "(4, 4)."
+            "order must be a whole number from 2 to 8, or a pair (K, L) of them, but is "
+            f"{order!r}; pass for instance 4 or (4, 3)."
         )
+    return int(pair[0]), int(pair[1])

@@ -59,6 +59,15 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see {self.prog} --help.")
 
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Name the command whose help lists what it takes, where there is an argument that it does not."""
+        known, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            raise InputError(
+                f"unrecognized arguments: {' '.join(unknown)}; see {self.prog} {known.command} --help."
+            )
+        return known
+
 
 def argument_parser() -> argparse.ArgumentParser:
     """The parser of `jaxfit`; what it cannot read raises `InputError`."""
@@ -111,7 +120,9 @@ def _add_batch(commands: Any) -> None:
 def _add_fit_options(parser: argparse.ArgumentParser) -> None:
     """What a single fit and each of many can be told."""
     parser.add_argument("--net", type=_pair, metavar="NUxNV", help="number of control points")
-    parser.add_argument("--order", type=_pair, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4)")
+    parser.add_argument(
+        "--order", type=_order, metavar="KxL", default=(4, 4), help="degree + 1 (default 4x4); 3 is 3x3"
+    )
     add_method_options(parser)
     parser.add_argument(
         "--grid", type=_pair, metavar="NxM", help="read scattered points as a grid, row by row"
@@ -149,6 +160,10 @@ def _pair(text: str) -> tuple[int, int]:
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r} is no pair of counts such as 8x6")
     return int(match[1]), int(match[2])
+
+
+def _order(text: str) -> tuple[int, int]:
+    return (int(text), int(text)) if re.fullmatch(r"\d", text, re.ASCII) else _pair(text)
 
 
 def _percent(text: str) -> float:

@@ -49,6 +49,24 @@ def test_a_gap_is_reported_with_its_place_and_size():
         Boundary(**sides)
 
 
+def test_corners_that_nearly_meet_are_joined_by_the_tolerance_that_is_named():
+    sides = square()
+    sides["u1"] = sides["u1"] + np.array([0.0, 0.0, 1e-3])
+    with pytest.raises(ValueError, match=r"pass tolerance=\S+ to Boundary to join them") as caught:
+        Boundary(**sides)
+    tolerance = float(str(caught.value).split("tolerance=")[1].split()[0])
+    assert 5.7e-4 < tolerance < 7e-4
+    np.testing.assert_array_equal(Boundary(**sides, tolerance=tolerance).u1[0], sides["v0"][-1])
+
+
+def test_reversed_polylines_that_nearly_meet_are_named_first():
+    sides = square()
+    sides["v1"] = sides["v1"][::-1]
+    sides["u1"] = sides["u1"] + np.array([0.0, 0.0, 1e-3])
+    with pytest.raises(ValueError, match="reverse v1"):
+        Boundary(**sides)
+
+
 @pytest.mark.parametrize("turned", [("v1",), ("u0", "u1")])
 def test_a_reversed_polyline_is_named(turned):
     sides = square()

@@ -75,6 +75,12 @@ def test_a_given_net_is_met_exactly(net):
     assert (np.diff(np.unique(surface.knots_u)) > 1e-3).all()
 
 
+def test_one_order_is_that_of_both_directions():
+    one, both = (base_surface(wavy_boundary(), net=(9, 10), order=order) for order in (3, (3, 3)))
+    assert one.order == both.order == (3, 3)
+    np.testing.assert_array_equal(one.control_points, both.control_points)
+
+
 def test_lowest_and_highest_order():
     surface = base_surface(wavy_boundary(), net=(9, 10), order=(2, 8))
     assert surface.order == (2, 8)
@@ -153,8 +159,9 @@ def test_a_second_boundary_compiles_nothing():
     [
         ({"net": (3, 9)}, "net must be at least 4 x 4"),
         ({"net": (9, 4), "order": (4, 5)}, "net must be at least 4 x 5"),
-        ({"order": (1, 4)}, "order must be a pair"),
-        ({"order": (4, 9)}, "order must be a pair"),
+        ({"order": (1, 4)}, "order must be a whole number from 2 to 8, or a pair"),
+        ({"order": 9}, "order must be a whole number from 2 to 8, or a pair"),
+        ({"order": (4, 9)}, "order must be a whole number from 2 to 8, or a pair"),
         ({"tolerance": 0.0}, "tolerance must be positive"),
         ({"points": np.ones((5, 2))}, "points must have 3 coordinates"),
     ],

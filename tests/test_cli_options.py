@@ -143,6 +143,8 @@ def test_options_arrive_as_fractions(fits, folder):
         "tolerance": pytest.approx(1e-4),
         "progress": None,
     }
+    assert run("cloud.npz", "--order", "3") == 0
+    assert fits.made[2][3]["order"] == (3, 3)
 
 
 def test_points_without_boundary_are_fitted_without(fits, folder):
@@ -298,6 +300,8 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "cloud.npz"], "-o/--output; see jaxfit fit --help"),
         (["fit", "-o", "s.npz"], "INPUT"),
         (["draw", "cloud.npz"], "'draw'"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--nets", "5x5"], "--nets 5x5; see jaxfit fit --help"),
+        (["batch", "cloud.npz", "-o", "new", "--no-picture"], "--no-picture; see jaxfit batch --help"),
         (["fit", "none.npz", "-o", "s.npz"], "none.npz does not exist"),
         (["fit", "bare.xyz", "-o", "s.npz", "--method", "interpolate"], "cannot be interpolated"),
         (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "7 x 7 grid of 49"),

@@ -90,6 +90,20 @@ def test_errors_at_rounding_level_are_left_to_the_iteration():
     assert not bool(fit.stats["solved"])
 
 
+def test_a_grid_in_order_gets_a_surface_without_folds():
+    # Points of a column lie so close together that closest points slide past several of them.
+    x, y = np.meshgrid(np.linspace(0, 1, 4), np.linspace(0, 1, 60), indexing="ij")
+    grid = np.stack([x, y, 0.8 * np.sin(4 * x) * np.cos(5 * y)], axis=-1)
+    as_found = jf.interpolate(grid, jf.GeometricInterpolation(solve_stalled=False, stall_gain=0.75))
+    fit = jf.interpolate(grid)
+    assert as_found.folds > 100
+    assert as_found.message.endswith("try StandardInterpolation().")
+    assert fit.folds == 0
+    assert bool(fit.converged), fit.message
+    assert bool(fit.stats["solved"])
+    assert int(fit.stats["num_steps"]) == int(as_found.stats["num_steps"]) + 1
+
+
 def test_a_symmetric_fit_stays_symmetric():
     grid = fuselage(41)
     reflection = jf.Reflection(normal=np.eye(3)[1])

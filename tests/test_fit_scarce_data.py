@@ -68,6 +68,8 @@ def test_a_single_weight_leaves_the_rest_of_the_base(method):
     fit = jf.approximate(points, flat_base(12), method(smoothing=0.0), weights=weights, max_steps=20)
     assert np.abs(fit.surface.control_points).max() < 5
     assert fit.average_error < 0.1
+    assert "There are 144 control points for 1 point" in fit.message
+    assert "12 x 12, more control points than points" in str(fit)
 
 
 @pytest.mark.parametrize("method", slow_except(METHODS, jf.StandardApproximation))

@@ -35,6 +35,11 @@ def random_grid(n, m, d, seed=0):
     return np.stack(parts, axis=-1) + 0.2 * rng.random((n, m, d))
 
 
+def test_one_order_is_that_of_both_directions():
+    grid = GRID[:5, :6]
+    np.testing.assert_array_equal(net_of(grid, 3), net_of(grid, (3, 3)))
+
+
 @pytest.mark.parametrize(
     ("n", "m", "d", "order"),
     [

@@ -232,6 +232,29 @@ def test_files_that_were_cut_are_noticed(tmp_path):
         read_points(tmp_path / "a.pcd")
 
 
+def without_last_lines(path, count):
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-count]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("write", "faces", "cut", "said"),
+    [
+        (ply, (), 2, "claims 6 points, but holds 4"),
+        (ply, FACES, len(FACES) + 1, "claims 6 points, but holds 5"),
+        (ply, FACES, 1, f"claims {len(FACES)} faces, but holds {len(FACES) - 1}"),
+        (off, FACES, 1, f"claims {len(FACES)} faces, but holds {len(FACES) - 1}"),
+    ],
+)
+def test_text_that_was_cut_at_the_end_of_a_line_is_noticed(tmp_path, write, faces, cut, said):
+    need("trimesh")
+    path = tmp_path / f"a.{write.__name__}"
+    write(path, POINTS, faces)
+    read_points(path)
+    with pytest.raises(InputError, match=said):
+        read_points(without_last_lines(path, cut))
+
+
 def test_too_few_points_are_refused(tmp_path):
     need("trimesh")
     with pytest.raises(InputError, match="3 points, but a surface needs"):

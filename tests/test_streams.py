@@ -139,6 +139,8 @@ def test_files_that_cannot_be_used_are_refused(base, tmp_path):
     path, archive = tmp_path / "points.npy", tmp_path / "points.npz"
     np.save(path, POINTS)
     np.savez(archive, points=POINTS)
+    with pytest.raises(FileNotFoundError, match=r"missing\.npy does not exist; check its name and folder\."):
+        jf.approximate_stream(tmp_path / "missing.npy", base)
     with pytest.raises(ValueError, match=r"feet_file must be a file of its own, but .*points\.npy is read"):
         jf.approximate_stream(path, base, feet_file=path)
     assert np.array_equal(np.load(path), POINTS)

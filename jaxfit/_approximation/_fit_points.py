@@ -30,7 +30,7 @@ from jaxfit._base import (
 from jaxfit._checks import (
     as_points,
     check_kind,
-    check_order,
+    checked_order,
     eager_where_concrete,
     is_concrete,
     without_derivatives,
@@ -47,7 +47,7 @@ def fit_points(
     points: Any,
     boundary: Boundary | None = None,
     net: tuple[int, int] | None = None,
-    order: tuple[int, int] = (4, 4),
+    order: int | tuple[int, int] = (4, 4),
     method: AbstractIterativeMethod | None = None,
     base: Coons | AbstractBaseMethod | None = None,
     faces: ArrayLike | None = None,
@@ -73,8 +73,8 @@ def fit_points(
         Default: the net grows, see Notes. Where it cannot, for fewer than 500 points, a method with an
         `insertion` of its own or a `start`: about one control point for every eight points,
         at least twice the order and at most 64 each way.
-    order : (K, L)
-        Degree + 1 along u and v (default (4, 4)).
+    order : (K, L) or int
+        Degree + 1 along u and v (default (4, 4)), each 2 to 8; one number is that of both.
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer. Only with a boundary.
@@ -166,7 +166,7 @@ def fit_points(
     (True, 0, 1)
     """
     _check_names(options)
-    check_order(order)
+    order = checked_order(order)
     if hasattr(points, "cloud"):
         points, boundary, faces = _parts(points, boundary, faces)
     if boundary is None and not isinstance(points, Boundary):

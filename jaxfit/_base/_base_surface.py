@@ -12,7 +12,14 @@ from jaxfit._base._host_splines import halve_widest_spans
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
 from jaxfit._base._same_place import check_same_place
-from jaxfit._checks import as_points, check_kind, check_number, check_order, eager_where_concrete, is_concrete
+from jaxfit._checks import (
+    as_points,
+    check_kind,
+    check_number,
+    checked_order,
+    eager_where_concrete,
+    is_concrete,
+)
 from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineSurface
 
@@ -27,7 +34,7 @@ def base_surface(
     boundary: Boundary,
     points: ArrayLike | None = None,
     net: tuple[int, int] | None = None,
-    order: tuple[int, int] = (4, 4),
+    order: int | tuple[int, int] = (4, 4),
     tolerance: float = 5e-3,
     abscissae: AbstractAbscissae = GREVILLE,
     method: Coons | AbstractBaseMethod | None = None,
@@ -54,8 +61,8 @@ def base_surface(
         curves closer than 0.02 of the domain and half a mean span are made equal before the fit.
         Methods that use the cloud then refine it, where it is smaller, to about one control
         point for every eight points, at most 64 each way.
-    order : (K, L)
-        Degree + 1 along u and v, each 2 to 8.
+    order : (K, L) or int
+        Degree + 1 along u and v, each 2 to 8; one number is that of both.
     tolerance : float
         How far from the reduced polyline Douglas-Peucker may leave a vertex, as a fraction of the size
         (default 5e-3): twice the greatest distance of any point from the boundary's centre of gravity,
@@ -95,6 +102,7 @@ def base_surface(
     ((4, 4), (4, 4), [1.0, 1.0, 1.0])
     """
     boundary = checked_boundary(boundary, points)
+    order = checked_order(order)
     net = _checked_net(boundary, net, order, tolerance)
     check_kind("abscissae", abscissae, AbstractAbscissae, "Greville()")
     check_kind("method", method, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
@@ -180,5 +188,4 @@ def _checked_net(
     check_number("tolerance", tolerance, 0.0)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")
-    check_order(order)
     return None if net is None else checked_net(net, order)

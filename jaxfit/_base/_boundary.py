@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 
 from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_concrete
 
+JOINABLE = 0.01  # of the diagonal: ends so close are meant to meet, as those of curves that were measured
+
 # The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
 _CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
 
@@ -173,11 +175,14 @@ def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) ->
     raise ValueError(
         f"boundary corners do not meet: the {'start' if v_end == 0 else 'end'} of {v} and the "
         f"{'start' if u_end == 0 else 'end'} of {u} are {gaps[worst]:.3g} apart "
-        f"({100 * gaps[worst] / size:.3g} % of the diagonal); {_remedy(lines, allowed)}."
+        f"({100 * gaps[worst] / size:.3g} % of the diagonal); {_remedy(lines, gaps[worst], size)}."
     )
 
 
-def _remedy(lines: dict[str, np.ndarray], allowed: float) -> str:
+def _remedy(lines: dict[str, np.ndarray], gap: float, size: float) -> str:
+    allowed = JOINABLE * size
+    if gap <= allowed:
+        return f"pass tolerance={1.1 * gap / size:.2g} to Boundary to join them, or share the corner points"
     if turned := _to_reverse(lines, allowed):
         return f"reverse {' and '.join(turned)}"
     for others in permutations(lines.values()):

@@ -34,5 +34,8 @@ def failed_fit(request: Request, options: dict[str, Any]) -> Fit:
         maximum_error=arrays[1],
         history=History(*history),
         result=RESULTS.diverged,
-        stats=stats_of(default_method(request.method), tolerances, 0, unknown, count),
+        stats={
+            **stats_of(default_method(request.method), tolerances, 0, unknown, count),
+            "points_not_finite": int((~np.isfinite(np.asarray(request.cloud)).all(axis=1)).sum()),
+        },
     )

@@ -38,8 +38,8 @@ def map_fits(
     """The fits of many clouds, from many base surfaces or by many methods, side by side.
 
     Fit i is `approximate(clouds[i], base[i], method[i], weights=weights[i], **options)`. What is given once
-    is shared by all. A cloud that is not finite fails alone: its fit has not converged, and its surface is
-    the base. The other fits are the same to the bit.
+    is shared by all. A cloud that is not finite fails alone: its fit has not converged, and says why, and its
+    surface is the base. The other fits are the same to the bit.
 
     Parameters
     ----------

@@ -51,9 +51,19 @@ def _is_of_cloud(fit: Any) -> bool:
 
 
 def _said_net(fit: Any) -> str:
+    return "{} x {}{}".format(*fit.surface.shape, ", more control points than points" * _has_surplus(fit))
+
+
+def _has_surplus(fit: Any) -> bool:
+    """Whether a cloud leaves some of the control points open."""
     nu, nv = fit.surface.shape
-    surplus = _is_of_cloud(fit) and nu * nv > np.size(fit.errors)
-    return f"{nu} x {nv}{', more control points than points' if surplus else ''}"
+    return _is_of_cloud(fit) and nu * nv > _points_that_count(fit)
+
+
+def _points_that_count(fit: Any) -> int:
+    """Those of a weight above 0; all if no iteration has counted them."""
+    active = fit.history.active
+    return (0 if active is None else int(np.max(active))) or np.size(fit.errors)
 
 
 def _said_iterations(fit: Any) -> str:
@@ -201,6 +211,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = f"{sentence.removesuffix('.')} by the base surface{advice}."
     if missed and _is_of_cloud(fit) and fit.result == RESULTS.stalled and not fit.stats["tol_average"]:
         sentence = "the errors have stopped falling."
+    if missed and (count := int(fit.stats.get("points_not_finite", 0))):
+        return f"{_said_points(count)} NaN or infinite, so nothing was fitted; remove or repair them."
     of_cloud = _is_of_cloud(fit) and fit.trimmed is None
     if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
         if share > MOST and fit.result == RESULTS.noise_reached:  # that is not noise
@@ -210,20 +222,29 @@ def said_reason(fit: Any, sentence: str) -> str:
             "this is not where they end; if the method holds it, free it by border=FreeBorder()."
         )
     if missed and fit.stats.get("points_out_of_reach", 0) > 0:
-        count = int(fit.stats["points_out_of_reach"])
-        points = f"{count:,} points are" if count > 1 else "1 point is"
+        points = _said_points(int(fit.stats["points_out_of_reach"]))
         sentence = (
             f"{sentence} {points} out of reach of a surface of this net that does not fold; insert knots, or "
             "look whether they lie on another sheet."
         )
+    if is_single(fit) and _has_surplus(fit):
+        net, count = np.prod(fit.surface.shape), _points_that_count(fit)
+        advice = "" if missed else "; a smaller net will do"
+        points = f"{count:,} point{'s' * (count != 1)}"
+        sentence = f"{sentence} There are {net:,} control points for {points}{advice}."
     if not (is_single(fit) and _is_finite(fit) and fit.folds):
         return sentence
     where = _places(fit.regularity) if fit.trimmed is None else f"{fit.folds:,} places inside its loops"
     kind = "grid" if not _is_of_cloud(fit) else "cloud" if fit.trimmed is None else "scan"
-    folds = f"the surface folds at {where}: {_REMEDIES[kind]}."
+    other = "; if so, try StandardInterpolation()" if not fit.stats.get("solved", True) else ""
+    folds = f"the surface folds at {where}: {_REMEDIES[kind]}{other}."
     if bool(fit.converged):
         return f"{sentence.removesuffix('.')}, but {folds}"
     return f"{sentence} T{folds[1:]}"
+
+
+def _said_points(count: int) -> str:
+    return f"{count:,} points are" if count > 1 else "1 point is"
 
 
 def _is_finite(fit: Any) -> bool:

@@ -112,11 +112,12 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         `stall_window` iterations, as it does at rounding level. It then returns the best surface whose
         closest points it has computed, or that of `solve_stalled`.
     solve_stalled : bool, default True
-        Whether a fit that stalls above rounding level makes one last step: it solves the linear system at the
-        parameters of the grid, and returns its solution, that of `StandardInterpolation`, where that is
-        closer. So that this comes soon, `stall_gain` is then at least 0.75: a fit that would need more than
-        some 600 iterations counts as stalled. Inside transformations (`jit`, `grad`, `vmap`) nothing is
-        solved, and such a fit ends as stalled; use `StandardInterpolation` there.
+        Whether a fit that stalls above rounding level, or whose surface folds, makes one last step: it
+        solves the linear system at the parameters of the grid, and returns its solution, that of
+        `StandardInterpolation`, where that is closer, or folds less. So that this comes soon, `stall_gain` is
+        then at least 0.75: a fit that would need more than some 600 iterations counts as stalled. Inside
+        transformations (`jit`, `grad`, `vmap`) nothing is solved, and such a fit ends as it is; use
+        `StandardInterpolation` there.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
-from jaxfit._interpolation._linear_finish import has_stalled, solved_at_grid, with_larger_stall_gain
+from jaxfit._interpolation._linear_finish import finished_at_grid, with_larger_stall_gain
 from jaxfit._interpolation._method import (
     CORNERS,
     Frame,
@@ -121,11 +121,10 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
         unconverged_feet=lost,
         stats={"diagonal": problem.unit.diagonal, "solved": np.bool_(False), **stats},
     )
-    if concrete and method.solve_stalled and has_stalled(loop, solution.errors.max(), frame.max_steps):
-        solution = solved_at_grid(
-            problem.order, data, start.averaged, symmetry, frame, loop.history, solution
-        )
-        if progress is not None:
+    if concrete and method.solve_stalled:
+        found = solution
+        solution = finished_at_grid(problem.order, data, start.averaged, symmetry, frame, loop, found)
+        if progress is not None and solution is not found:
             errors = float(solution.errors.mean()), float(solution.errors.max())
             progress(int(solution.steps), int(frame.max_steps), *errors)
     return solution, frame

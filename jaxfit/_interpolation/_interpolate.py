@@ -11,10 +11,10 @@ from jaxfit._checks import (
     as_floating,
     check_kind,
     check_number,
-    check_order,
     check_progress,
     check_steps,
     check_switch,
+    checked_order,
     eager_where_concrete,
     has_coordinates_first,
     is_concrete,
@@ -36,7 +36,7 @@ METHODS = "GeometricInterpolation(), StandardInterpolation() or NormalInterpolat
 def interpolate(
     grid: Any,
     method: AbstractInterpolation | None = None,
-    order: tuple[int, int] = (4, 4),
+    order: int | tuple[int, int] = (4, 4),
     tolerance: ArrayLike | None = None,
     max_steps: int = 1000,
     progress: Progress | None = None,
@@ -55,8 +55,8 @@ def interpolate(
     method : GeometricInterpolation(), StandardInterpolation() or NormalInterpolation(), optional
         Default `GeometricInterpolation()`, or `NormalInterpolation()` where there are normals: it alone meets
         them, and needs them.
-    order : (K, L)
-        Degree + 1 along the first and the second index, each 2 to 8.
+    order : (K, L) or int
+        Degree + 1 along the first and the second index, each 2 to 8; one number is that of both.
     tolerance : float, optional
         The largest error allowed, as a fraction of the diagonal of the data's bounding box. Default
         1e-12 in float64, 2e-6 in float32, and more where the data is so far from the origin that rounding its
@@ -104,7 +104,7 @@ def interpolate(
     """
     check_switch("throw", throw)
     check_progress(progress)
-    check_order(order)
+    order = checked_order(order)
     check_steps("max_steps", max_steps)
     if tolerance is not None:
         check_number("tolerance", tolerance, 0.0)
@@ -129,7 +129,7 @@ def _scaled(data: Any, normals: Any, order: tuple[int, int], tolerance: Any, max
     if normals is not None:
         normals = np.asarray(normals, dtype) if is_concrete(normals) else normals.astype(dtype)
     frame = Frame(unit.within(dtype), corners, diagonal, goal, tolerance, np.int32(max_steps))
-    return GridProblem(inner, normals, frame, unit, (int(order[0]), int(order[1])))
+    return GridProblem(inner, normals, frame, unit, order)
 
 
 def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
@@ -146,7 +146,7 @@ def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
         first = has_coordinates_first(data.shape)
         advice = "pass np.moveaxis(grid, 0, -1)" if first else "give more points or lower the order"
         raise ValueError(
-            f"grid must have at least {order[0]} x {order[1]} points for order {tuple(order)}, but has "
+            f"grid must have at least {order[0]} x {order[1]} points for order {order}, but has "
             f"shape {data.shape}; {advice}."
         )
     if not is_concrete(data):

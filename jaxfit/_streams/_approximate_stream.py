@@ -74,6 +74,8 @@ def approximate_stream(
     ValueError
         If a block is not finite or has the wrong shape, which the sentence says by the number of the block;
         if the source holds fewer than four points or gives others in a later pass; or as `approximate` does.
+    FileNotFoundError
+        If the source is the path of a file that does not exist.
     TypeError
         If the method needs all points together, or the source is an iterator, which can be read only once.
 

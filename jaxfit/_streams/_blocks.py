@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._checks import as_points
+from jaxfit._checks import as_points, said_missing
 
 Source = str | os.PathLike[str] | np.ndarray | Iterable[Any] | Callable[[], Iterable[Any]]
 Points = Float[np.ndarray, "points d"]
@@ -71,6 +71,8 @@ def _mapped(path: str | os.PathLike[str]) -> np.ndarray:
     try:
         with open(path, "rb") as file:
             np.lib.format.read_magic(file)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(said_missing(path)) from error
     except ValueError as error:
         raise ValueError(
             f"source must be the path of a .npy file, but {os.fspath(path)} is none; save the points by "

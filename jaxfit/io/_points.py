@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base import Boundary
+from jaxfit._checks import said_missing
 from jaxfit.io._arrays import load_arrays
 from jaxfit.io._point_data import InputError, PointData, grid_data
 from jaxfit.io._scans import SCANS, read_scan
@@ -136,7 +137,7 @@ def check_input(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file in it ({path}/* names all to `jaxfit batch`).")
     if not path.exists():
-        raise InputError(f"{path} does not exist; check its name and folder.")
+        raise InputError(said_missing(path))
     if path.suffix.lower() not in suffixes:
         raise InputError(
             f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, "

@@ -103,7 +103,10 @@ def _mesh(path: Path, trimesh: Any) -> Found:
     options = {"process": False, "maintain_order": True, "skip_materials": True}
     scene = trimesh.load_scene(str(path), **options)
     pieces, corners, used = [np.empty((0, 3))], [np.empty((0, 3), int)], [np.empty(0, bool)]
+    if path.suffix.lower() == ".off":
+        _check_faces_of_off(path)
     for geometry in scene.geometry.values():
+        _check_elements_of_ply(path, geometry.metadata.get("_ply_raw", {}))
         vertices = np.asarray(geometry.vertices, np.float64)
         faces = np.asarray(getattr(geometry, "faces", ()), int).reshape(-1, 3)
         referenced = np.full(len(vertices), not len(faces))
@@ -140,9 +143,27 @@ def _columns(x: Any, y: Any, z: Any) -> Points:
     return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=1)
 
 
-def _check_count(path: Path, count: int, claimed: int) -> None:
+def _check_count(path: Path, count: int, claimed: int, what: str = "points") -> None:
     if count != claimed:
-        raise InputError(f"{path} claims {claimed} points, but holds {count}; it was cut, so write it again.")
+        raise InputError(f"{path} claims {claimed} {what}, but holds {count}; it was cut, so write it again.")
+
+
+def _check_elements_of_ply(path: Path, elements: Any) -> None:
+    """Raise where text was cut, of which trimesh takes the lines that are there."""
+    for name, what in (("vertex", "points"), ("face", "faces")):
+        element = elements.get(name, {})
+        columns = element.get("data")
+        if isinstance(columns, dict):  # binary data that was cut is refused by trimesh
+            _check_count(path, min(map(len, columns.values())), element["length"], what)
+
+
+def _check_faces_of_off(path: Path) -> None:
+    """Raise where faces were cut off, for trimesh takes those that are there."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    bare = "\n".join(line.split("#")[0].strip() for line in text.splitlines())
+    lines = [line for line in bare.split("OFF", 1)[1].splitlines() if line.strip()]
+    vertices, faces = map(int, lines[0].split()[:2])
+    _check_count(path, min(len(lines) - 1 - vertices, faces), faces, "faces")
 
 
 def _one_line(error: Exception) -> str:
