@@ -117,8 +117,8 @@ def test_progress_is_reported_after_every_pass(base, streamed):
 
 def test_a_diverging_fit_goes_back_to_its_last_good_surface(base):
     places = np.random.default_rng(3).random((2, 3000))
-    points = np.asarray(base(*places))  # so near that any smoothing is far worse
-    method = jf.StandardApproximation(smoothing=1e6, border=jf.FreeBorder())
+    points = np.asarray(base(*places))
+    method = jf.StandardApproximation(smoothing=1e305, border=jf.FreeBorder())  # a step is not finite
     fit = jf.approximate_stream(points, base, method, 0.0, block_size=BLOCK, errors=jf.LocalFeet())
     assert fit.result == jf.RESULTS.diverged
     assert np.array_equal(fit.surface.control_points, base.control_points)
