@@ -243,3 +243,32 @@ def test_raw_scans_refuse_to_be_differentiated_before_they_are_meshed(monkeypatc
         jax.grad(lambda x: jf.fit_points(POINTS, method=jf.OrthogonalDistance(x)).average_error)(1e-3)
     with pytest.raises(TypeError, match="boundary must be given where"):
         jf.fit_points(POINTS, adjoint=jf.ImplicitAdjoint())
+
+
+@pytest.mark.parametrize("name", slow_except(["plate", "unrolled", "grid"], "grid"))
+def test_a_fit_whose_feet_move_is_not_differentiated_twice(name):
+    """It would be a wrong number."""
+    grid = (
+        np.asarray(EDGES["u0"])[:, None] * [[[1.0], [0.9], [0.7], [0.5]]]
+        + np.eye(3)[1] * np.arange(4)[:, None]
+    )
+    functions = {
+        "plate": lambda t: height_of(POINTS + t, WEIGHTS)[0],
+        "unrolled": lambda t: height_of(POINTS + t, WEIGHTS, adjoint=jf.UnrolledAdjoint(), max_steps=2)[0],
+        "grid": lambda t: jf.interpolate(grid + t * grid**2).surface(0.3, 0.6)[2],
+    }
+    with pytest.raises(TypeError, match="differentiable once only"):
+        jax.grad(jax.grad(functions[name]))(0.0)
+
+
+def test_standard_interpolation_has_a_second_derivative():
+    x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
+    grid = np.stack([x, y, 0.3 * np.sin(3 * x) * np.cos(2 * y)], axis=-1)
+    move = np.random.default_rng(3).normal(size=grid.shape)
+
+    def height(t):
+        return jnp.sum(jf.interpolate(grid + t * move, jf.StandardInterpolation()).surface(0.37, 0.41) ** 3)
+
+    slope = jax.grad(height)
+    difference = (slope(1e-5) - slope(-1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(slope)(0.0), difference, rtol=1e-6)

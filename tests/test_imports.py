@@ -14,7 +14,7 @@ ROOMS = [
     ("_interrupt", "_version", "_cores"),
     ("_checks",),
     ("_precision", "_progress_line"),
-    ("_varying",),
+    ("_varying", "_differentiable_once"),
     ("_kept_programs",),
     ("_unrolling", "_barrier", "_compile", "_program_folder"),
     ("_splines",),

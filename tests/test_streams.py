@@ -115,11 +115,14 @@ def test_progress_is_reported_after_every_pass(base, streamed):
     assert streamed.stats["passes"] == len(seen) + 2
 
 
-def test_a_diverging_fit_goes_back_to_its_last_good_surface(base):
+def test_a_diverging_fit_goes_back_to_its_last_good_surface(base, monkeypatch):
+    monkeypatch.setattr("jaxfit._fit._loop.MAX_AVERAGE", 1e-9)
     places = np.random.default_rng(3).random((2, 3000))
-    points = np.asarray(base(*places))
-    method = jf.StandardApproximation(smoothing=1e305, border=jf.FreeBorder())  # a step is not finite
-    fit = jf.approximate_stream(points, base, method, 0.0, block_size=BLOCK, errors=jf.LocalFeet())
+    points = np.asarray(base(*places))  # so near that any smoothing is far worse
+    method = jf.StandardApproximation(smoothing=1e6, border=jf.FreeBorder())
+    # A number of iterations of its own, and so a program.
+    options = dict(block_size=BLOCK, errors=jf.LocalFeet(), max_steps=17)
+    fit = jf.approximate_stream(points, base, method, 0.0, **options)
     assert fit.result == jf.RESULTS.diverged
     assert np.array_equal(fit.surface.control_points, base.control_points)
     assert fit.errors.max() < 1e-9

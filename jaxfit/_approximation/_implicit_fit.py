@@ -25,6 +25,7 @@ from jaxfit._approximation._stationarity_residual import (
 from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
+from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._method import dynamic_fields
 from jaxfit._fit._problem import Problem
@@ -110,7 +111,7 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), tangents[2:])
+    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (differentiated(inputs),), tangents[2:])
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
@@ -173,21 +174,7 @@ def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitI
 @_fitted_at_rest.defjvp
 def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
-    return _implicit(rest, at_rest, end, jax.tree.map(only_once, inputs), tangents[2])
-
-
-@jax.custom_jvp
-def only_once(x: Any) -> Any:
-    """`x`, in a derivative that has none itself."""
-    return x
-
-
-@only_once.defjvp
-def _refuse(primals: Any, tangents: Any) -> Any:
-    raise TypeError(
-        "a fit has no second derivative by ImplicitAdjoint(), which is exact to first order only; take "
-        "differences of gradients."
-    )
+    return _implicit(rest, at_rest, end, differentiated(inputs), tangents[2])
 
 
 @partial(compiled, kept=True, static_argnums=0)

@@ -13,6 +13,7 @@ from jax import Array, lax
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing
 from jaxfit._approximation._implicit_fit import EndOfFit, FitInputs, base_net_of, given_feet_of, problem_of
 from jaxfit._compile import compiled
+from jaxfit._differentiable_once import differentiable_once
 from jaxfit._fit._loop import LoopState, begin, iterate
 from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
 from jaxfit._fit._scaling import Unit
@@ -36,6 +37,7 @@ def unrolled_fit(
         method = dataclasses.replace(method, **chosen)
     _, rest = dynamic_fields(method)
     inputs = FitInputs.of(cloud, base, method, request)
+    inputs = differentiable_once(inputs) if method.finds_feet else inputs
     loop, stats, diagonal = _unrolled(rest, max_steps, first, inputs)
     return loop, stats, dataclasses.replace(first.unit, diagonal=diagonal)
 

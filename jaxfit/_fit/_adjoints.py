@@ -31,7 +31,8 @@ class UnrolledAdjoint(AbstractAdjoint):
     without the short cuts of `single_step`, and linear systems are solved to rounding, so the surface differs
     a little from that of a fit without a derivative. What is decided (whether a step is accepted, where knots
     are inserted, which lambda is chosen, when the fit ends) counts as constant; where it is about to change,
-    one-sided derivatives differ. At rest `ImplicitAdjoint` is faster, and needs no memory for iterations.
+    one-sided derivatives differ. Where feet move there is no second derivative: differentiating twice raises
+    TypeError. At rest `ImplicitAdjoint` is faster, and needs no memory for iterations.
 
     Of an interpolation: feet are followed through the iterations before they are held, each by the implicit
     derivative of its closest point. The net then solves $N(\hat u, \hat v) P = Q$, and so does its derivative
@@ -97,6 +98,8 @@ class ImplicitAdjoint(AbstractAdjoint):
 
     A lambda that `GeneralizedCrossValidation` or `Discrepancy` has chosen counts as a constant: differences
     of fits also hold what its choice changes.
+
+    There is no second derivative: differentiating twice raises TypeError.
 
     Of an interpolation: the derivative at held parameters and knots, $dP = N(\hat u, \hat v)^{-1} dQ$. Any
     parameters at which the surface meets the data solve the interpolation problem, so this is the derivative

@@ -30,9 +30,9 @@ from jaxfit._varying import as_varying, as_varying_as
 FIRST_CHUNK = 4  # iterations between two reports of progress, to begin with
 REPORT_SECONDS = 0.3
 BLOCK = 16  # iterations of an unrolled fit that are kept at a time
-# Average errors beyond so many times the first one count as divergence, where they also exceed the diagonal:
-# a surface that meets the points from the start may well be smoothed.
-MAX_GROWTH = 1e3
+# An average error beyond the diagonal plus so many times the first one counts as divergence: a surface that
+# meets the points from the start may well be smoothed.
+MAX_AVERAGE, MAX_GROWTH = 1.0, 1e3
 
 Progress = Callable[[int, int, float, float], None]
 
@@ -207,7 +207,7 @@ def _decide(
     step, goal = iterate.step, problem.tolerances
     average, maximum = history.at(step)[0], history.at(step)[1]
     finite = jnp.isfinite(maximum) & jnp.all(jnp.isfinite(iterate.surface.control_points))
-    sound = finite & (average <= 1.0 + MAX_GROWTH * history.first)
+    sound = finite & (average <= MAX_AVERAGE + MAX_GROWTH * history.first)
     met = (average <= goal.average) & (maximum <= goal.maximum)
     stalled = history.is_stalled(step, method.stall_after, method.stall_gain, method.stall_since)
     outcomes = (
