@@ -60,3 +60,14 @@ def with_outliers(fit: Any, sentence: str, share: float) -> str:
         f"{sentence} {share:.0%} of all errors are those of {FEW:.0%} of the points; if these are outliers, "
         "judge the surface by the others, and leave them out or pass a method with loss=Tukey()."
     )
+
+
+def with_sides(sentence: str, far: dict[str, Any]) -> str:
+    """The reason, and that sides of the boundary are not where the points are."""
+    *most, last = far
+    sides = f"sides {', '.join(most)} and {last}" if most else f"side {last}"
+    away = 100 * float(max(far.values()))
+    return (
+        f"{sentence} The points are {away:.2g} % of the diagonal away from {sides} of the boundary, to which "
+        "the surface keeps; look whether it is theirs."
+    )

@@ -15,6 +15,7 @@ from jaxfit._fit._remarks import (
     share_of_outliers,
     with_border,
     with_outliers,
+    with_sides,
 )
 from jaxfit._quality import Regularity
 from jaxfit._splines import BSplineSurface
@@ -198,6 +199,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = with_border(fit, sentence, beyond)
     if outliers:
         sentence = with_outliers(fit, sentence, outliers)
+    if is_single(fit) and (far := fit.stats.get("far_sides")):
+        sentence = with_sides(sentence, far)
     if missed and beyond <= MOST and not outliers and fit.stats.get("points_out_of_reach", 0) > 0:
         count = int(fit.stats["points_out_of_reach"])
         points = f"{count:,} points are" if count > 1 else "1 point is"
