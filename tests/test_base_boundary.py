@@ -5,7 +5,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxfit._base import Boundary
+import jaxfit as jf
+from jaxfit._base import Boundary, far_sides
 
 
 def square(n=5):
@@ -136,3 +137,35 @@ def test_masked_polylines_are_refused():
     sides["v1"] = np.ma.masked_greater(sides["v1"], 0.9)
     with pytest.raises(ValueError, match="v1 must not be masked"):
         Boundary(**sides)
+
+
+def test_sides_that_are_not_where_the_points_are_are_told():
+    points, edges = helpers.wavy_cloud(600)
+    boundary = Boundary(**edges)
+    assert far_sides(points, boundary, 6e-4) == {}
+    assert far_sides(np.repeat(points[::6], 6, axis=0), boundary, 0.0) == {}
+    below = far_sides(points + np.array([0.0, 0.0, 0.5]), boundary, 6e-4)
+    assert list(below) == ["v0", "v1", "u0", "u1"]
+    assert all(0.2 < x < 0.4 for x in below.values())
+    assert far_sides(points + np.array([0.0, 0.0, 0.5]), boundary, 0.1) == {}  # less than what may be missed
+    far = far_sides(points[points[:, 1] > 0.4], boundary, 6e-4)
+    assert list(far) == ["v0"]
+    x, y = np.meshgrid(np.linspace(0.05, 0.95, 10), np.linspace(0, 1, 100), indexing="ij")
+    lines = np.stack([x, y, 0 * x], axis=2).reshape(-1, 3)  # ten times as far apart as their points
+    frame = helpers.grid_edges(np.pad(lines.reshape(10, 100, 3), ((1, 1), (0, 0), (0, 0)), mode="edge"))
+    frame["u0"][:, 0], frame["u1"][:, 0] = -0.05, 1.05
+    for name in ("v0", "v1"):
+        frame[name][[0, -1], 0] = -0.05, 1.05
+    assert far_sides(lines, Boundary(**frame), 0.0) == {}
+
+
+def test_a_fit_names_the_sides_that_are_far_from_its_points():
+    points, edges = helpers.wavy_cloud(100)
+    boundary, method = Boundary(**edges), jf.GeometricApproximation()
+    options = dict(net=(6, 5), base=jf.Coons(), max_steps=0, tol_average=1.0)
+    fit = jf.fit_points(points + np.array([0.0, 0.0, 0.9]), boundary, method=method, **options)
+    assert fit.stats["far_sides"] == {}  # the tolerance is as wide
+    fit = jf.fit_points(
+        points + np.array([0.0, 0.0, 0.9]), boundary, method=method, **(options | {"tol_average": 1e-3})
+    )
+    assert "% of the diagonal away from sides v0, v1, u0 and u1 of the boundary" in fit.message

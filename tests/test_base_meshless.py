@@ -1,5 +1,7 @@
 """Meshless parameters keep shapes whatever the density; the base at them is near any cloud."""
 
+import warnings
+
 import helpers
 import jax
 import numpy as np
@@ -201,6 +203,14 @@ def test_poor_clouds_give_finite_surfaces_within_reach(kind):
     net = nets(poor, boundary)
     assert np.isfinite(net).all()
     assert np.abs(net).max() < 4
+
+
+def test_a_boundary_far_from_the_points_gives_parameters_without_warnings():
+    points, edges = helpers.wavy_cloud(600)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        u, v = jf.meshless_parameters(points + np.array([0.0, 0.0, 0.5]), jf.Boundary(**edges))
+    assert np.isfinite(np.stack([u, v])).all()
 
 
 def test_a_cloud_larger_than_asked_for_is_thinned():

@@ -254,6 +254,27 @@ def test_points_that_lie_mostly_beyond_the_border_are_told(base):
     )
     grown = dataclasses.replace(fit, result=jf.RESULTS.noise_reached)
     assert re.match(r"finer nets bring .* to the points\. 9\d% of all errors", grown.message)
+    grown = dataclasses.replace(fit, result=jf.RESULTS.net_exhausted)
+    assert re.search(r"number of points\. 9\d% of all errors", grown.message)  # another net is no help
+    assert fit.stats["points_beyond_border"] > 300
+
+
+def test_outliers_above_the_border_are_not_beyond_it(base):
+    u, v = np.random.default_rng(0).uniform(size=(2, 500))
+    u[:10], v[:10] = 0.01, np.linspace(0.8, 0.95, 10)
+    points = np.array(base(u, v))
+    points[:10, 2] += 0.3  # where the surface rises outwards: their feet are on the border
+    fit = jf.approximate(points, base, jf.GeometricApproximation(), max_steps=0, tol_average=1e-4)
+    assert (np.asarray(fit.u)[:10] == 0).all()
+    assert fit.stats["points_beyond_border"] == 0
+    assert "100% of all errors are those of 5% of the points; if these are outliers" in fit.message
+    rested = dataclasses.replace(fit, result=jf.RESULTS.net_exhausted)
+    assert "pass a net" not in rested.message
+    weights = np.where(np.arange(500) < 10, 0.0, 1.0)
+    counted = jf.approximate(
+        points, base, jf.GeometricApproximation(), max_steps=0, tol_average=0, weights=weights
+    )
+    assert "outliers" not in counted.message
 
 
 def test_held_and_untouched_control_points_keep_every_bit(base):

@@ -7,8 +7,8 @@ import pytest
 from helpers import count_compilations, diagonal
 
 import jaxfit as jf
-from jaxfit._approximation._errors_of_neighbours import errors_of_neighbours
-from jaxfit._approximation._growing_net import GROWTH, NetGrowth, far_from
+from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, errors_of_neighbours
+from jaxfit._approximation._growing_net import GROWTH, Level, NetGrowth, far_from
 from jaxfit._approximation._level_nets import FIRST_SIZE, BoundaryNets
 from jaxfit._base import carried_base, net_of_sides
 from jaxfit._closest import _nearest_feet
@@ -190,6 +190,26 @@ def test_a_tolerance_that_the_points_do_not_carry_is_reported():
 
 
 @pytest.mark.slow
+def test_no_net_grows_where_most_points_lie_beyond_a_border_that_is_held(monkeypatch):
+    middle = height(*np.meshgrid(*2 * [np.linspace(0.25, 0.75, 40)], indexing="ij"))
+    boundary = jf.Boundary.from_grid(middle)
+    some = CLEAN[:600]
+    request = dict(weights=None, tol_average=6e-4, tol_maximum=None, max_steps=50, start=None)
+
+    def growth(method):
+        found = NetGrowth(some, BoundaryNets(boundary, (4, 4), some), method, request)
+        base, points = jf.base_surface(boundary, net=(8, 8)), some[found.sorted]
+        fit = jf.approximate(points, base, jf.GeometricApproximation(), max_steps=0)
+        level = Level(8.0, fit, 0.1, ErrorsOfNeighbours(0.0, 0.1))
+        monkeypatch.setattr(found, "_level", lambda *_: level)
+        return found, level
+
+    held, level = growth(jf.OrthogonalDistance())
+    assert held.grown(level.fit.surface) == (level, jf.RESULTS.stalled)
+    free, level = growth(jf.OrthogonalDistance(border=jf.FreeBorder()))
+    assert not free._reaches_beyond(level)
+
+
 def test_few_points_and_other_wishes_keep_one_net():
     few = jf.fit_points(CLEAN[:400], BOUNDARY, tol_average=1e-3, max_steps=5)
     assert few.surface.shape == (8, 8)

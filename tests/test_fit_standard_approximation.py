@@ -214,6 +214,26 @@ def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
     assert reached < 1.3 * least
 
 
+def test_a_base_surface_that_follows_noise_does_not_decide_on_lambda():
+    points = wavy_cloud(800)[0]
+    noisy = points + 0.03 * np.random.default_rng(0).normal(size=points.shape)
+    method = jf.StandardApproximation(smoothing=jf.GeneralizedCrossValidation())
+
+    def selected(kind):
+        start = jf.base_surface(BOUNDARY, noisy, net=(16, 16), method=kind)
+        options = dict(max_steps=1, tol_average=1e-9, errors=jf.LocalFeet())
+        return float(jf.approximate(noisy, start, method, **options).stats["smoothing"])
+
+    assert 0.5 < selected(jf.Meshless()) / selected(jf.Coons()) < 2  # it was 1e-5
+
+
+def test_where_the_base_surface_is_returned_no_lambda_was_in_force(base):
+    method = jf.StandardApproximation(smoothing=jf.GeneralizedCrossValidation(rounds=1))
+    fit = jf.approximate(POINTS, base, method, tol_average=0.1)
+    assert int(fit.stats["num_steps"]) == 0
+    assert np.isnan(float(fit.stats["smoothing"]))
+
+
 def test_the_discrepancy_principle_stops_at_the_noise():
     smoothing = jnp.asarray([1e-3, 1e-2, 1e-1])
     found = SmoothingCandidates(smoothing, jnp.asarray([1.0, 4.0, 16.0]), smoothing, jnp.asarray(400.0))

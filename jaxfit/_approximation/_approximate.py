@@ -77,7 +77,10 @@ def approximate(
     Returns
     -------
     Fit
-        Its errors are measured as `errors` says. The iteration itself and its history use local feet.
+        Its errors are measured as `errors` says. The iteration itself and its history use local feet. Outside
+        transformations `stats` also hold the number of `points_beyond_border`, whose feet are on the border
+        and which lie farther along the tangent plane there than across it, at four times the usual distance;
+        and their share of the sum of all errors, `errors_beyond_border`.
 
     Raises
     ------

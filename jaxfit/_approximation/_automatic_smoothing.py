@@ -28,6 +28,9 @@ from jaxfit._normal_equations import BlockCholesky, NormalOperator, RegularisedS
 from jaxfit._splines._pieces import pieces_on
 
 DECADES = (-9.0, 3.0)  # around where both parts of the matrix have the same trace
+# A surface with so many points for each effective parameter does not follow noise. Where feet on it have a
+# lambda that is FOLLOWS times as large, those on the given surface follow noise.
+FEW, FOLLOWS = 128.0, 10.0
 
 
 class SmoothingCandidates(eqx.Module):
@@ -54,9 +57,9 @@ class GeneralizedCrossValidation(AbstractSmoothing):
 
     The noise need not be known. It must be independent from point to point, and the parameters must not
     follow it. They do follow it on a base made with the points (`Meshless`) where the noise is as large as
-    the distances between points. lambda is then too small by orders of magnitude, and `Discrepancy` is the
-    better choice. In the derivative of a fit the lambda that was found counts as a constant. Golub, Heath and
-    Wahba, Technometrics 21 (1979).
+    the distances between points. Therefore lambda is also selected at closest points on a surface with one
+    effective parameter for 128 points, and taken where it is ten times as large. In the derivative of a fit
+    the lambda that was found counts as a constant. Golub, Heath and Wahba, Technometrics 21 (1979).
 
     Parameters
     ----------
@@ -64,7 +67,8 @@ class GeneralizedCrossValidation(AbstractSmoothing):
         The number of lambdas (default 17), spaced evenly in their logarithm over twelve decades. A parabola
         through the best three gives the minimum.
     rounds : int
-        The number of selections (default 2): at the first parameters, then at corrected ones.
+        The number of selections (default 2): at the first parameters, then at corrected ones. With 1 no
+        smoother surface is tried.
 
     Raises
     ------
@@ -151,6 +155,12 @@ def _cross_validated(candidates: SmoothingCandidates) -> Float[Array, ""]:
     return jnp.exp(logarithm[k] + jnp.clip(offset, -1.0, 1.0) * step)
 
 
+def _least_of_few(candidates: SmoothingCandidates) -> Float[Array, ""]:
+    """The lambda that leaves one effective parameter to FEW points, too few to follow their noise."""
+    effective = lax.cummax(candidates.effective[::-1])
+    return jnp.exp(jnp.interp(candidates.points / FEW, effective, jnp.log(candidates.smoothing[::-1])))
+
+
 def _check_counts(rule: Any) -> None:
     check_number("candidates", rule.candidates, 3, whole=True)
     check_number("rounds", rule.rounds, 1, whole=True)
@@ -215,19 +225,27 @@ def _select(
     rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
 ) -> Float[Array, ""]:
     """Each round selects lambda, solves with it, and corrects the parameters."""
-    held, diagonal = method.held(surface), problem.diagonal
-
-    def one_round(_: Any, last: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
-        net, here, _ = last
-        system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
-        candidates = evaluate_candidates(system, held, net, rule.candidates)
-        scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
-        smoothing = rule.best(scaled)
-        system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
-        net, _ = method.solver(least_squares_problem(system, held, net))
-        return net, method.project(problem, surface.moved_to(net), here), smoothing
-
-    rounds = rule.rounds if method.parameter_correction else 1
-    net = surface.control_points
+    held, diagonal, net = method.held(surface), problem.diagonal, surface.control_points
     start = eqx.tree_at(lambda p: p.exact, projection, jnp.asarray(True))
-    return lax.fori_loop(0, rounds, one_round, (net, start, jnp.zeros((), net.dtype)))[2]
+
+    def selected(first: Any) -> Float[Array, ""]:
+        """The lambda after all rounds, and before them `first` rounds that keep to few parameters."""
+
+        def one_round(index: Any, last: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
+            net, here, _ = last
+            system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
+            candidates = evaluate_candidates(system, held, net, rule.candidates)
+            scaled = eqx.tree_at(lambda c: c.remaining, candidates, candidates.remaining / diagonal**2)
+            smoothing, least = rule.best(scaled), _least_of_few(candidates)
+            smoothing = jnp.where(index < first, jnp.maximum(smoothing, least), smoothing)
+            system = eqx.tree_at(lambda s: s.smoothing, system, smoothing)
+            net, _ = method.solver(least_squares_problem(system, held, net))
+            return net, method.project(problem, surface.moved_to(net), here), smoothing
+
+        rounds = first + rule.rounds if method.parameter_correction else 1
+        return lax.fori_loop(0, rounds, one_round, (net, start, jnp.zeros((), net.dtype)))[2]
+
+    if rule.rounds == 1 or not method.parameter_correction:
+        return selected(0)
+    given, smooth = lax.map(selected, jnp.arange(2))
+    return jnp.where(smooth > FOLLOWS * given, smooth, given)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from jaxfit._approximation._beyond_border import points_beyond_border
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._errors import AbstractErrors, Feet, GlobalFeet
 from jaxfit._approximation._implicit_fit import (
@@ -92,7 +93,7 @@ def fit_cloud(
         stats = stats | {"stationarity": share}
     parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete, room)
     stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
-    fit = _fit(loop, problem, parts, unit, surface, stats, getattr(method, "fairing", None))
+    fit = _fit(loop, problem, cloud, parts, unit, surface, stats, getattr(method, "fairing", None))
     return converged_or_raise(fit) if request["throw"] else fit
 
 
@@ -261,6 +262,7 @@ def _at_feet(
 def _fit(
     loop: LoopState,
     problem: Problem,
+    cloud: Any,
     parts: Feet,
     unit: Unit,
     surface: BSplineSurface,
@@ -280,6 +282,7 @@ def _fit(
     maximum = xp.max(xp.where(counted, relative, 0.0))
     arrays: Any = (u, v, relative, average, maximum)
     if concrete:
+        stats = stats | _at_border(surface, cloud, (u, v), relative, counted)
         arrays = jax.device_put([np.asarray(x, problem.target.dtype) for x in arrays])
     return Fit(
         surface=surface,
@@ -294,6 +297,13 @@ def _fit(
         ),
         stats=stats,
     )
+
+
+def _at_border(surface: BSplineSurface, cloud: Any, feet: Any, errors: Any, counted: Any) -> dict[str, Any]:
+    """How many points lie beyond the border, and their share of the sum of all errors."""
+    beyond = points_beyond_border(surface, cloud, feet, errors, counted)
+    share = errors[beyond].sum() / max(errors[counted].sum(), np.finfo(float).tiny)
+    return {"points_beyond_border": beyond.sum(), "errors_beyond_border": share}
 
 
 def final_code(code: Any, errors: tuple[Any, Any], loss: Any, goal: Tolerances) -> Any:

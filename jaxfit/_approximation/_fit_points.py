@@ -1,5 +1,6 @@
 """`fit_points`: a base surface from the boundary of a cloud, then a fit."""
 
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -26,6 +27,7 @@ from jaxfit._base import (
     checked_net,
     default_base,
     default_net,
+    far_sides,
 )
 from jaxfit._checks import (
     as_points,
@@ -36,7 +38,7 @@ from jaxfit._checks import (
     without_derivatives,
 )
 from jaxfit._fit._method import AbstractIterativeMethod
-from jaxfit._fit._result import Fit
+from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._progress_line import doing, shows_progress
 from jaxfit._scan import check_measured
 
@@ -94,15 +96,16 @@ def fit_points(
     -------
     Fit
         Where the net has grown, `stats` also hold `growth_steps`: iterations with all nets before the last
-        fit. Without a boundary `stats` also hold `points_read` and of these the number of `non_finite`,
-        `nodata`, `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the `hole_length` in
-        force, `feet_on_border`: points on the sheet whose foot is on the border of the domain; and
-        `sheet_area`, that of the mesh, near which `trimmed.area()` is. Its vertices are moved along their
-        normals to the mean with their neighbours first, for noise makes a mesh rough and its area too large.
-        `counted` says which points are on the sheet. `trimmed` is the surface cut to the sheet, a
+        fit. With a boundary they hold `far_sides`: sides that are far from all points, each with its distance
+        as a fraction of the diagonal. Without a boundary `stats` also hold `points_read` and of these the
+        number of `non_finite`, `nodata`, `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the
+        `hole_length` in force, `feet_on_border`: points on the sheet whose foot is on the border of the
+        domain; and `sheet_area`, that of the mesh, near which `trimmed.area()` is. Its vertices are moved
+        along their normals to the mean with their neighbours first, for noise makes a mesh rough and its area
+        too large. `counted` says which points are on the sheet. `trimmed` is the surface cut to the sheet, a
         `TrimmedSurface`. Points that were left out have errors as well, but do not count; where they are not
-        finite u, v and errors are NaN. A coordinate that stands for no data (nines such as -9999, the ends
-        of 16 bits, beyond 1e20) makes a point `nodata`, which counts as not finite, if it is far from all
+        finite u, v and errors are NaN. A coordinate that stands for no data (nines such as -9999, the ends of
+        16 bits, beyond 1e20) makes a point `nodata`, which counts as not finite, if it is far from all
         others.
 
     Raises
@@ -190,14 +193,26 @@ def fit_points(
     check_measured("points", np.asarray(fixed), "leave them out, or the boundary, for a raw scan is cleaned")
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
-        request = _DEFAULTS | options
+        request = _DEFAULTS | options | {"throw": False}
         nets = BoundaryNets(boundary, order, np.asarray(cloud))
         growth = NetGrowth(nets.points, nets, default_method(method), request)
         first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, lambda: nets.meshless)
-        return fit_growing(growth, first)
-    net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
-    check_net_of_cloud(net, cloud.shape[0])
-    return approximate(cloud, _base(boundary, fixed, net, order, base), method, **options)
+        fit = fit_growing(growth, first)
+    else:
+        net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
+        check_net_of_cloud(net, cloud.shape[0])
+        begun = _base(boundary, fixed, net, order, base)
+        fit = approximate(cloud, begun, method, **(options | {"throw": False}))
+    far = _far_sides(fixed, boundary, _DEFAULTS | known)
+    fit = dataclasses.replace(fit, stats=fit.stats | {"far_sides": far})
+    return converged_or_raise(fit) if options.get("throw", False) else fit
+
+
+def _far_sides(cloud: Any, boundary: Boundary, request: dict[str, Any]) -> dict[str, float]:
+    """Sides that are far from the points that count."""
+    weights, goals = request["weights"], (request["tol_average"], request["tol_maximum"])
+    some = np.asarray(cloud, float)[slice(None) if weights is None else np.asarray(weights) > 0]
+    return far_sides(some, boundary, min(float(x) for x in goals if x is not None))
 
 
 def _check_no_derivative(cloud: Any, method: Any, options: dict[str, Any]) -> None:

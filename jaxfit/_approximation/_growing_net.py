@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._approximation._beyond_border import points_beyond_border
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, errors_of_neighbours
@@ -17,6 +18,7 @@ from jaxfit._approximation._regular_smoothing import RegularSmoothing
 from jaxfit._approximation._room import Room
 from jaxfit._base import mean_distance_to
 from jaxfit._closest import chunk_size
+from jaxfit._fit._border import FixedBorder
 from jaxfit._fit._reasons import RESULTS
 from jaxfit._fit._result import Fit, converged_or_raise
 from jaxfit._splines import BSplineSurface
@@ -47,6 +49,8 @@ MULTIPLE = 4  # of control points that there is room for: clouds of similar shap
 # A cloud without outliers is fitted on while one of its points is farther from the surface than so many times
 # the tolerance of the average: that may be met before the fit has come to the ends of a scroll.
 FAR = 10.0
+# No net helps where so many of the points lie so far beyond a border that is held, in diagonals.
+MANY_BEYOND, FAR_BEYOND = 0.25, 0.01
 EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
@@ -117,6 +121,8 @@ class NetGrowth:
             level = self._level(size, base, before, met is not None)
             if before is not None:
                 level = self._found_again(level, met is not None)
+            elif not self._is_met(level) and self._reaches_beyond(level):
+                return level, RESULTS.stalled
             nearer = met is None or level.beside.farthest < NEARER * met.beside.farthest
             if met is not None and not (self._is_met(level) and nearer):
                 return met, RESULTS.converged
@@ -140,6 +146,16 @@ class NetGrowth:
         if bool(level.fit.converged):
             return True
         return self.far < np.inf and float(level.fit.average_error) <= float(self.request["tol_average"])
+
+    def _reaches_beyond(self, level: Level) -> bool:
+        """Whether many points lie far beyond the border, which is held."""
+        if not isinstance(getattr(self.method, "border", None), FixedBorder):
+            return False
+        some, _ = self._chosen(level.size)
+        fit, counted = level.fit, self.weights[some] > 0
+        errors = np.asarray(fit.errors)
+        beyond = points_beyond_border(fit.surface, self.points[some], (fit.u, fit.v), errors, counted)
+        return bool((beyond & (errors > FAR_BEYOND)).sum() > MANY_BEYOND * counted.sum())
 
     def _level(self, size: float, base: BSplineSurface, before: Level | None, farther: bool) -> Level:
         """The fit with a net of this size; with `farther` it goes on to a maximum of `far`, too."""

@@ -79,7 +79,8 @@ class StandardApproximation(AbstractIterativeMethod):
 
     Notes
     -----
-    The fit's `stats` contain `smoothing`, the lambda in force; `bending_energy`, the integral above in the
+    The fit's `stats` contain `smoothing`, the lambda in force, NaN where one was to be chosen and the base
+    surface met the tolerances without; `bending_energy`, the integral above in the
     squared unit of the data; and `shift`. A normal matrix that is nearly singular is shifted by this share of
     its diagonal; 0 for a regular one. It is singular without smoothing where the points are too few for the
     net. The system is solved for the correction of the present surface, so that whatever the data does not
@@ -212,4 +213,7 @@ class StandardApproximation(AbstractIterativeMethod):
         """The iterate as it is; lambda, the integral (10), and the largest shift."""
         energy = plate_of(iterate.state.plate, iterate.surface).energy(iterate.surface.control_points)
         stats = {"bending_energy": energy * problem.scale**2}
-        return iterate, stats | {"smoothing": iterate.state.smoothing, "shift": iterate.state.shift}
+        smoothing = iterate.state.smoothing
+        if isinstance(self.smoothing, AbstractSmoothing):
+            smoothing = jnp.where(iterate.step > 0, smoothing, jnp.nan)
+        return iterate, stats | {"smoothing": smoothing, "shift": iterate.state.shift}

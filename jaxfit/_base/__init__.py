@@ -25,6 +25,7 @@ from jaxfit._base._delaunay_stars import share_on_circles as share_on_circles
 from jaxfit._base._delaunay_stars import stars as stars
 from jaxfit._base._delaunay_stars import supported_planes as supported_planes
 from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
+from jaxfit._base._far_sides import far_sides as far_sides
 from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless import MeshlessAt as MeshlessAt

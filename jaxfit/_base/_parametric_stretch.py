@@ -45,10 +45,12 @@ def link_weights(
     """Less than 1 for neighbours that lie far apart in the domain for their distance in space.
 
     Links from one sheet to another that comes near are few and long; those within a sheet are many. With
-    weights that fall as the square of the length, so that a longer link pulls less, the many win.
+    weights that fall as the square of the length, so that a longer link pulls less, the many win. Where most
+    have no length, for all points went to one place, there is no telling.
     """
     far = np.linalg.norm(points[star.members] - points[:, None], axis=2)
     ratio = np.linalg.norm(places[star.members] - places[:, None], axis=2)
     ratio = ratio / np.where(star.filled, far, 1.0)
     most = LONGEST * float(np.median(ratio[star.filled]))
-    return np.where(star.filled & (ratio > most), (most / np.where(ratio > 0, ratio, 1.0)) ** 2, 1.0)
+    far_apart = star.filled & (ratio > most) & (most > 0)
+    return np.where(far_apart, (most / np.where(ratio > 0, ratio, 1.0)) ** 2, 1.0)

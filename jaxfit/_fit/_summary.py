@@ -8,6 +8,15 @@ import numpy as np
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._remarks import (
+    MOST,
+    MUCH,
+    share_beyond_border,
+    share_of_outliers,
+    with_border,
+    with_outliers,
+    with_sides,
+)
 from jaxfit._quality import Regularity
 from jaxfit._splines import BSplineSurface
 
@@ -15,8 +24,6 @@ if TYPE_CHECKING:
     from jaxfit._fit._result import Fit
 
 
-FAR = 4.0  # times the average error of points inside the border
-MUCH, MOST = 0.05, 0.5  # shares of the sum of errors
 MANY_HOLES = 20
 _REMEDIES = {
     "grid": "look there whether the grid's points are in order, and none repeats its neighbour "
@@ -186,21 +193,6 @@ def _moves(fit: Any) -> int:
     return int(fit.stats["num_steps"]) + before
 
 
-def _share_at_border(fit: Any) -> float:
-    """What points far from the surface whose feet are on its border add to the sum of all errors."""
-    errors = np.asarray(fit.errors)
-    at_ends = np.any(
-        [
-            np.isin(np.asarray(x), np.asarray(limits))
-            for x, limits in zip((fit.u, fit.v), fit.surface.domain, strict=True)
-        ],
-        axis=0,
-    )
-    usual = np.mean(errors, where=~at_ends) if not at_ends.all() else 0.0
-    beyond = at_ends & (errors > FAR * usual)
-    return float(errors[beyond].sum() / max(errors.sum(), np.finfo(float).tiny))
-
-
 def said_reason(fit: Any, sentence: str) -> str:
     """The reason for which a fit stopped, that nothing was fitted if so, and that its surface folds if it
     does, or was kept from folding.
@@ -213,15 +205,15 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = "the errors have stopped falling."
     if missed and (count := int(fit.stats.get("points_not_finite", 0))):
         return f"{_said_points(count)} NaN or infinite, so nothing was fitted; remove or repair them."
-    of_cloud = _is_of_cloud(fit) and fit.trimmed is None
-    if missed and of_cloud and (share := _share_at_border(fit)) > MUCH:
-        if share > MOST and fit.result == RESULTS.noise_reached:  # that is not noise
-            sentence = "finer nets bring the surface no nearer to the points."
-        sentence = (
-            f"{sentence} {share:.0%} of all errors are those of points beyond the border of the surface, so "
-            "this is not where they end; if the method holds it, free it by border=FreeBorder()."
-        )
-    if missed and fit.stats.get("points_out_of_reach", 0) > 0:
+    beyond = share_beyond_border(fit) if missed else 0.0
+    outliers = share_of_outliers(fit) if missed and beyond <= MUCH else 0.0
+    if beyond > MUCH:
+        sentence = with_border(fit, sentence, beyond)
+    if outliers:
+        sentence = with_outliers(fit, sentence, outliers)
+    if is_single(fit) and (far := fit.stats.get("far_sides")):
+        sentence = with_sides(sentence, far)
+    if missed and beyond <= MOST and not outliers and fit.stats.get("points_out_of_reach", 0) > 0:
         points = _said_points(int(fit.stats["points_out_of_reach"]))
         sentence = (
             f"{sentence} {points} out of reach of a surface of this net that does not fold; insert knots, or "
