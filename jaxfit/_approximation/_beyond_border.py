@@ -22,10 +22,10 @@ def points_beyond_border(
     """Those that count, are far from the surface, have their feet on its border, and lie along the tangent
     plane there rather than across it, as an outlier above the surface does.
     """
-    at_ends = np.any(
-        [np.isin(np.asarray(x), np.asarray(ends)) for x, ends in zip(feet, surface.domain, strict=True)],
-        axis=0,
-    )
+    at_ends = np.zeros(len(errors), bool)
+    for x, ends in zip(feet, surface.domain, strict=True):
+        for end in ends:
+            at_ends |= np.asarray(x) == np.asarray(end)
     inside = counted & ~at_ends
     usual = errors[inside].mean() if inside.any() else 0.0
     beyond = counted & at_ends & (errors > FAR * usual)

@@ -301,6 +301,7 @@ def _fit(
 
 def _at_border(surface: BSplineSurface, cloud: Any, feet: Any, errors: Any, counted: Any) -> dict[str, Any]:
     """How many points lie beyond the border, and their share of the sum of all errors."""
+    errors, counted = np.asarray(errors), np.asarray(counted)
     beyond = points_beyond_border(surface, cloud, feet, errors, counted)
     share = errors[beyond].sum() / max(errors[counted].sum(), np.finfo(float).tiny)
     return {"points_beyond_border": beyond.sum(), "errors_beyond_border": share}
