@@ -261,6 +261,7 @@ def test_a_fit_whose_feet_move_is_not_differentiated_twice(name):
         jax.grad(jax.grad(functions[name]))(0.0)
 
 
+@pytest.mark.slow
 def test_standard_interpolation_has_a_second_derivative():
     x, y = np.meshgrid(np.linspace(0, 1, 6), np.linspace(0, 1, 5), indexing="ij")
     grid = np.stack([x, y, 0.3 * np.sin(3 * x) * np.cos(2 * y)], axis=-1)

@@ -210,13 +210,20 @@ def test_no_net_grows_where_most_points_lie_beyond_a_border_that_is_held(monkeyp
     assert not free._reaches_beyond(level)
 
 
-def test_few_points_and_other_wishes_keep_one_net():
-    few = jf.fit_points(CLEAN[:400], BOUNDARY, tol_average=1e-3, max_steps=5)
-    assert few.surface.shape == (8, 8)
+def test_few_points_and_other_wishes_keep_one_net(monkeypatch):
+    shapes = []
+
+    def approximate(points, base, *_, **options):
+        shapes.append(base.shape)
+        raise StopIteration
+
+    monkeypatch.setattr("jaxfit._approximation._fit_points.approximate", approximate)
     inserting = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=50))
-    assert jf.fit_points(CLEAN, BOUNDARY, method=inserting, max_steps=2).surface.shape == (20, 19)
     start = tuple(np.full(COUNT, 0.5) for _ in "uv")
-    assert jf.fit_points(CLEAN, BOUNDARY, start=start, max_steps=1).surface.shape == (20, 19)
+    for points, wish in ((CLEAN[:400], {}), (CLEAN, {"method": inserting}), (CLEAN, {"start": start})):
+        with pytest.raises(StopIteration):
+            jf.fit_points(points, BOUNDARY, **wish)
+    assert shapes == [(8, 8), (20, 19), (20, 19)]
 
 
 def test_no_net_has_more_than_a_control_point_for_two_points():

@@ -214,6 +214,7 @@ def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
     assert reached < 1.3 * least
 
 
+@pytest.mark.slow
 def test_a_base_surface_that_follows_noise_does_not_decide_on_lambda():
     points = wavy_cloud(800)[0]
     noisy = points + 0.03 * np.random.default_rng(0).normal(size=points.shape)
