@@ -106,6 +106,7 @@ def test_the_papers_setting_is_at_hand():
         jf.KnotInsertion(every=0)
 
 
+@pytest.mark.slow
 def test_local_mode_meets_the_tolerance_and_leaves_the_rest_to_the_bit():
     base = jf.base_surface(jf.Boundary(**EDGES), net=(12, 12))
     points = np.asarray(base(*np.random.default_rng(1).random((2, 500))))

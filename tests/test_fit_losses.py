@@ -59,6 +59,7 @@ def test_least_squares_is_no_loss_at_all():
     assert abs(float(far) - 5.0) < 1e-4
 
 
+@pytest.mark.slow
 def test_outliers_do_not_spoil_orthogonal_distance(base, wild):
     assert spoilt(jf.OrthogonalDistance(loss=jf.Huber()), base, wild, 10) < 5e-4
 

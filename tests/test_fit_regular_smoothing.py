@@ -81,6 +81,7 @@ def test_noise_is_not_fitted(base):
     assert automatic < 0.6 * away[1e-9]
 
 
+@pytest.mark.slow
 def test_weights_and_units_have_no_influence(coarse):
     points, _ = wavy_cloud(1500)
     fit = jf.approximate(points, coarse, tol_average=1e-6, max_steps=5)

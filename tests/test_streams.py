@@ -51,7 +51,7 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_except(METHODS, "standard", "single steps"))
+@pytest.mark.parametrize("name", slow_except(METHODS, "standard"))
 def test_a_fit_in_blocks_is_the_fit_in_memory(base, name):
     method = METHODS[name]
     if name == "paper":  # in memory feet start ahead: the tolerance of feet is what both share
@@ -119,9 +119,9 @@ def test_a_diverging_fit_goes_back_to_its_last_good_surface(base, monkeypatch):
     monkeypatch.setattr("jaxfit._fit._loop.MAX_AVERAGE", 1e-9)
     places = np.random.default_rng(3).random((2, 3000))
     points = np.asarray(base(*places))  # so near that any smoothing is far worse
-    method = jf.StandardApproximation(smoothing=1e6, border=jf.FreeBorder())
-    # A number of iterations of its own, and so a program.
-    options = dict(block_size=BLOCK, errors=jf.LocalFeet(), max_steps=17)
+    # A stall window of its own, and so a program.
+    method = jf.StandardApproximation(smoothing=1e6, border=jf.FreeBorder(), stall_window=17)
+    options = dict(block_size=BLOCK, errors=jf.LocalFeet())
     fit = jf.approximate_stream(points, base, method, 0.0, **options)
     assert fit.result == jf.RESULTS.diverged
     assert np.array_equal(fit.surface.control_points, base.control_points)
