@@ -16,17 +16,20 @@ GRID = 0.25  # and where so many stars have a point on a circle, points make a g
 WIDEST = 0.99 * np.pi  # a larger angle between two neighbours is a gap
 
 
-def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_votes: int = 2) -> Faces:
+def neighbourhood_mesh(
+    points: Float[Any, "points 3"], length: float, least_votes: int = 2, on_lines: bool = False
+) -> Faces:
     """Oriented triangles between the points, without edges longer than `length`.
 
     Every point has its Delaunay star in its own tangent plane, so that walls and overhangs are as good as
     flat parts. A triangle is in the stars of all of its three corners where these agree. Those in all three
     come first, then those in at least `least_votes` that fit in between, the shortest first. Among noise
-    triangles in one star make bridges, so of others only those are taken that fill a notch. Triangles between
-    corners whose normals differ much come last: they may join sheets that face each other.
+    triangles in one star make bridges. On a grid, or where points are `on_lines`, stars disagree on diagonals
+    where the sheet bends, and those are taken that fill a notch. Triangles between corners whose normals
+    differ much come last: they may join sheets that face each other.
     """
     planes = supported_planes(points, PLANE_NEIGHBOURS)
-    star = _stars(planes)
+    star, is_grid = _stars(planes)
     faces, votes = _candidates(star)
     longest = longest_edges(points, faces)
     short = longest <= length
@@ -36,18 +39,20 @@ def neighbourhood_mesh(points: Float[Any, "points 3"], length: float, least_vote
     unlike = (np.sum(corners * np.roll(corners, 1, axis=1), axis=2) < ALIKE).any(axis=1)
     order = np.lexsort((longest, -votes, unlike))
     faces, agreed = _oriented(points, planes.normals, faces[order]), votes[order] >= least_votes
-    return manifold(faces[agreed], faces[~agreed])
+    return manifold(faces[agreed], faces[~agreed] if is_grid or on_lines else None)
 
 
-def _stars(planes: Planes) -> Stars:
-    """On a bent grid the corners of a square would disagree on its diagonal, each in its own plane: there all
+def _stars(planes: Planes) -> tuple[Stars, bool]:
+    """The stars, and whether the points make a grid.
+
+    On a bent grid the corners of a square would disagree on its diagonal, each in its own plane: there all
     four see both, of which the shorter one is taken.
     """
     count = len(planes.points)
     wide = stars(planes.points, NEIGHBOURS, fixed=count, planes=planes, straight=STRAIGHT)
     if share_on_circles(wide, STRAIGHT) > GRID:
-        return wide
-    return stars(planes.points, NEIGHBOURS, fixed=count, planes=planes)
+        return wide, True
+    return stars(planes.points, NEIGHBOURS, fixed=count, planes=planes), False
 
 
 def _candidates(star: Stars) -> tuple[Faces, Int[np.ndarray, " faces"]]:

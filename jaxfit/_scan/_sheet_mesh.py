@@ -45,9 +45,9 @@ def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> 
     nodes = cloud[chosen]
     if faces is not None:
         return _from_faces(cloud, nodes, faces, chosen, length)
-    nodes = thinned_along_lines(nodes)
+    every, nodes = len(nodes), thinned_along_lines(nodes)
     try:
-        return _by_neighbours(cloud, nodes, length)
+        return _by_neighbours(cloud, nodes, length, on_lines=len(nodes) < every)
     except RoughError as error:
         if is_level(cloud):
             return _level(cloud, length)
@@ -55,11 +55,15 @@ def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> 
 
 
 def _by_neighbours(
-    cloud: np.ndarray, nodes: np.ndarray, length: float | None, noise: bool = True
+    cloud: np.ndarray,
+    nodes: np.ndarray,
+    length: float | None,
+    noise: bool = True,
+    on_lines: bool = False,
 ) -> tuple[SheetMesh, float]:
     """The mesh of nodes that neighbours agree on."""
     reach = _hole_length(nodes) if length is None else length
-    found = neighbourhood_mesh(nodes, reach)
+    found = neighbourhood_mesh(nodes, reach, on_lines=on_lines)
     if _coverage(nodes, found) < COVERED:
         found = neighbourhood_mesh(nodes, reach, least_votes=1)
     if len(found) > COVERED * 2 * len(nodes):
