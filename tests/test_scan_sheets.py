@@ -88,13 +88,13 @@ def test_points_strewn_about_a_sheet_are_outliers(count, size):
 
 def test_points_at_a_wrong_level_are_no_second_sheet():
     """They are few, if far apart: their triangles are as large as the sheet."""
-    x, y = np.random.default_rng(0).uniform(0, 1, (2, 2400))
-    points = np.stack([x, y, 1 + 0.1 * np.sin(4 * x)], axis=1)
-    points[:48, 2] = 0.0
+    x, y = (np.random.default_rng(0).uniform(0, 1, (4800, 2)) * [80, 60]).T
+    points = np.stack([x, y, 100 + 5 * np.sin(x / 20)], axis=1)
+    points[:100, 2] = 0.0
     sheet = sheet_of(points)
-    assert sheet.counts["off_the_sheet"] == 48
-    assert not sheet.on_sheet[:48].any()
-    assert sheet.area == pytest.approx(1.04, rel=0.04)
+    assert sheet.counts["off_the_sheet"] == 100
+    assert not sheet.on_sheet[:100].any()
+    assert sheet.area == pytest.approx(4860, rel=0.04)
 
 
 def test_points_that_do_not_count_have_no_say_in_the_sheet():

@@ -12,9 +12,8 @@ from jaxfit._scan._even_choice import even_choice
 
 NEIGHBOURS = 16, 64, 256  # of a point: more of them are on a line that is itself several points wide
 NARROW = 0.35  # where their spread across it is so small a part of that along it,
-NARROW_SHARE = (
-    0.02  # and the cloud is on lines where as many of its points are: planes across its rim turn first
-)
+# and the cloud is on lines where as many of its points are. Planes across its rim turn round a line first.
+NARROW_SHARE = 0.05
 ENOUGH = 2000  # points to tell
 PART = 8  # neighbours are at most one in so many points, or they are no neighbours
 
