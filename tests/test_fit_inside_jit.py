@@ -124,3 +124,16 @@ def test_rounding_alone_is_no_excuse_for_any_error():
     fit = jf.interpolate(np.asarray(far), jf.StandardInterpolation())
     assert float(fit.stats["tolerance"]) <= 1e-3
     assert not bool(fit.converged) or float(fit.maximum_error) <= 1e-3
+
+
+def test_fit_points_takes_traced_tolerances_and_weights():
+    """What it says about the sides of the boundary needs numbers, and is left out."""
+    boundary = jf.Boundary(**wavy_cloud(200)[1])
+    method = jf.StandardApproximation(1e-3)
+
+    def error(tolerance, weights):
+        options = dict(net=(6, 7), method=method, max_steps=2, tol_average=tolerance, weights=weights)
+        return jf.fit_points(wavy_cloud(200)[0], boundary, **options).average_error
+
+    arguments = 1e-3, np.ones(200)
+    np.testing.assert_allclose(jax.jit(error)(*arguments), error(*arguments), rtol=1e-9)

@@ -275,8 +275,8 @@ def _fit(
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)
     relative = distance / unit.diagonal
-    loss = unit.loss(np.asarray(surface.control_points)) if concrete else 0.0
-    relative = relative + loss
+    loss = unit.loss(np.asarray(surface.control_points)) if concrete else None
+    relative = relative if loss is None else relative + loss
     counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
     average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
     maximum = xp.max(xp.where(counted, relative, 0.0))

@@ -96,8 +96,9 @@ def fit_points(
     -------
     Fit
         Where the net has grown, `stats` also hold `growth_steps`: iterations with all nets before the last
-        fit. With a boundary they hold `far_sides`: sides that are far from all points, each with its distance
-        as a fraction of the diagonal. Without a boundary `stats` also hold `points_read` and of these the
+        fit. With a boundary, outside `jit` and `vmap`, they hold `far_sides`: sides that are far from all
+        points, each with its distance as a fraction of the diagonal. Without a boundary they hold
+        `points_read` and of these the
         number of `non_finite`, `nodata`, `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the
         `hole_length` in force, `feet_on_border`: points on the sheet whose foot is on the border of the
         domain; and `sheet_area`, that of the mesh, near which `trimmed.area()` is. Its vertices are moved
@@ -203,8 +204,9 @@ def fit_points(
         check_net_of_cloud(net, cloud.shape[0])
         begun = _base(boundary, fixed, net, order, base)
         fit = approximate(cloud, begun, method, **(options | {"throw": False}))
-    far = _far_sides(fixed, boundary, _DEFAULTS | known)
-    fit = dataclasses.replace(fit, stats=fit.stats | {"far_sides": far})
+    if is_concrete(known):
+        far = _far_sides(fixed, boundary, _DEFAULTS | known)
+        fit = dataclasses.replace(fit, stats=fit.stats | {"far_sides": far})
     return converged_or_raise(fit) if options.get("throw", False) else fit
 
 

@@ -111,7 +111,7 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (differentiated(inputs),), tangents[2:])
+    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), tangents[2:])
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
@@ -185,7 +185,6 @@ def _implicit(
     at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
     here = at_rest.projection
     surface = end.surface.moved_to(at_rest.net)
-    # That of the last step of polishing, or of one so near that it serves here, too.
     system = at_rest.system
 
     def at(net: Array, inputs: FitInputs) -> tuple[Array, Fitted]:

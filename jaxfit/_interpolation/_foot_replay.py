@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from jaxfit._closest import ParameterBounds
 from jaxfit._closest._implicit import foot_change
 from jaxfit._compile import compiled
+from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import side_bounds
 from jaxfit._interpolation._point_collocation import PointCollocation, at_cells, control_point_windows
@@ -70,6 +71,7 @@ def attach_derivative(
 @attach_derivative.defjvp
 def _attach_jvp(method: Any, order: tuple[int, int], primals: Any, tangents: Any) -> Any:
     fitted, path, inputs = primals
+    inputs = differentiated(inputs) if path.shape[0] else inputs  # held feet have every derivative
     fitted = attach_derivative(method, order, fitted, path, inputs)  # for derivatives of the derivative
     return jax.jvp(partial(_replayed, method, order, fitted, path), (inputs,), tangents[2:])
 

@@ -12,7 +12,6 @@ from jax import Array, lax
 
 from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
-from jaxfit._differentiable_once import differentiable_once
 from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._loop import LoopState, begin, run
 from jaxfit._fit._problem import Problem, Tolerances
@@ -104,9 +103,7 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
     if not concrete:
         # Of the method only what plays a part, so that other choices compile nothing.
         how = dataclasses.replace(method, symmetry=None, solve_stalled=False)
-        path = end.state.path
-        inputs = differentiable_once(inputs) if path.shape[0] else inputs
-        fitted = attach_derivative(how, problem.order, Fitted(net, u, v), path, inputs)
+        fitted = attach_derivative(how, problem.order, Fitted(net, u, v), end.state.path, inputs)
         net, u, v = fitted.net, fitted.u, fitted.v
     error, lost = (
         here.error,

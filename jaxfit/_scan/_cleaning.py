@@ -24,7 +24,6 @@ class Cleaned(NamedTuple):
     """Numbers of the points that are kept, and how many are not."""
 
     kept: Int[np.ndarray, " kept"]
-    non_finite: int
     duplicates: int
     outliers: int
 
@@ -49,7 +48,7 @@ def cleaned(points: Float[Any, "points 3"]) -> Cleaned:
         kept = kept[~(single | strewn)]
         if not strewn.any():
             break
-    return Cleaned(kept, len(points) - len(finite), len(finite) - len(distinct), len(distinct) - len(kept))
+    return Cleaned(kept, len(finite) - len(distinct), len(distinct) - len(kept))
 
 
 def _outliers(points: np.ndarray) -> tuple[Bool[np.ndarray, " points"], Bool[np.ndarray, " points"]]:

@@ -29,7 +29,7 @@ def _added(candidates: list[list[int]], taken: set[tuple[int, int]], shared: int
     for face in candidates:
         a, b, c = face
         edges = ((a, b), (b, c), (c, a))
-        if taken.isdisjoint(edges) and (not shared or sum((y, x) in taken for x, y in edges) >= shared):
+        if taken.isdisjoint(edges) and sum((y, x) in taken for x, y in edges) >= shared:
             taken.update(edges)
             added.append(face)
     return added
