@@ -15,8 +15,9 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-# Before anything imports jaxfit: every function of the package then checks its annotations.
-install_import_hook("jaxfit", "beartype.beartype")
+# Rooms whose functions are called for every array that a program computes with. Their annotations are checked
+# by the passes --slow and --float32; in the first pass that would take a seventh of its time.
+KERNELS = {"_splines", "_cells", "_closest", "_normal_equations"}
 
 settings.register_profile(
     "jaxfit", database=None, deadline=None, derandomize=True, max_examples=20, print_blob=False
@@ -46,9 +47,18 @@ def compile_quickly():
         os.environ["XLA_FLAGS"] = flags
 
 
+def check_annotations(kernels):
+    """Every function of jaxfit, or of all rooms but KERNELS, checks what it is given and what it returns."""
+    package = Path(__file__).parents[1] / "jaxfit"
+    names = {path.stem for path in package.iterdir() if not path.stem.startswith("__")}
+    rooms = ["jaxfit"] if kernels else [f"jaxfit.{name}" for name in names - KERNELS]
+    install_import_hook(rooms, "beartype.beartype")
+
+
 def pytest_configure(config):
     if config.getoption("--slow") and config.getoption("--float32"):
         raise pytest.UsageError("--slow and --float32 are two passes: run one after the other")
+    check_annotations(kernels=config.getoption("--slow") or config.getoption("--float32"))
     # The pass in single precision runs the code that users get.
     if not config.getoption("--float32") and not hasattr(config, "workerinput"):
         compile_quickly()

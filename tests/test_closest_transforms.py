@@ -106,6 +106,7 @@ def test_derivatives_are_finite_on_the_surface_borders_corners_and_poles():
             assert np.isfinite(leaf).all()
 
 
+@pytest.mark.slow
 def test_second_derivatives_equal_differences_of_first_ones(problem):
     surface, points, start = problem
 

@@ -180,6 +180,7 @@ def test_impossible_methods_get_a_sentence(options, sentence):
         jf.GeometricApproximation(**options)
 
 
+@pytest.mark.slow
 def test_local_mode_goes_on_to_the_average_once_the_maximum_is_met(base):
     begun = jf.approximate(POINTS, base, max_steps=0)
     tolerances = dict(tol_average=0.1 * float(begun.average_error), tol_maximum=float(begun.maximum_error))

@@ -100,6 +100,7 @@ def test_the_first_net_shows_the_waves_of_the_sides():
     assert max(net_of_sides(rough, (4, 4), 150)) <= 10  # noise takes no finer net
 
 
+@pytest.mark.slow
 def test_errors_of_neighbours_are_alike_where_the_net_is_too_coarse():
     method = jf.GeometricApproximation()
     for noise, least, most in ((0.0, 0.6, 1.0), (0.05, -0.1, 0.1)):

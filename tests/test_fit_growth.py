@@ -84,6 +84,7 @@ def test_batches_grow_each_their_own_way(base):
         assert abs(float(averages[k] - average)) < 1e-6
 
 
+@pytest.mark.slow
 def test_one_step_feet_come_as_close_as_converged_ones(base):
     ends = []
     for single_step in (False, True):

@@ -98,6 +98,7 @@ def test_what_does_not_fit_gets_a_sentence(options, sentence):
         jf.interpolate(GRID, **options)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences():
     rng = np.random.default_rng(3)
     pull = rng.normal(size=(14, 18, 3))

@@ -175,6 +175,7 @@ def test_the_objective_falls_below_that_of_standard_approximation(base, fit):
     assert (before[:, [0, -1]] == after[:, [0, -1]]).all()
 
 
+@pytest.mark.slow
 def test_no_step_is_kept_that_makes_the_distances_worse(base):
     method = jf.OrthogonalDistance(smoothing=0.0, damping=1e-6, reach=50.0, stall_gain=0.0)
     few = np.repeat([1.0, 0.0], [120, len(POINTS) - 120])

@@ -90,6 +90,7 @@ def test_weights_and_units_have_no_influence(coarse):
     assert np.abs(np.asarray(scaled.surface.control_points) / 64 - fit.surface.control_points).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_spline_surface_is_found_again():
     got = data("bspline_reference")
     net, size = got["control_points"], diagonal(got["points"])
@@ -179,6 +180,7 @@ def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time
             np.testing.assert_array_less(after.factor, 8.0)
 
 
+@pytest.mark.slow
 def test_a_fit_that_ends_early_is_not_smoothed_once_more(coarse):
     points, _ = pocketed()
     averages = [

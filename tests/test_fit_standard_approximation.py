@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import count_compilations, eps, wavy_cloud
+from helpers import count_compilations, eps, slow_except, wavy_cloud
 from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
@@ -71,10 +71,10 @@ def test_weights_and_a_free_boundary(base):
     assert apart(fit, dense_solution(base, SMOOTHING, True, weights)) < 1e-10
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [jf.GaussNewton(), jf.LevenbergMarquardt(), jf.JaxoptGaussNewton(), jf.JaxoptLevenbergMarquardt()],
-)
+DRIVERS = [jf.GaussNewton(), jf.LevenbergMarquardt(), jf.JaxoptGaussNewton(), jf.JaxoptLevenbergMarquardt()]
+
+
+@pytest.mark.parametrize("solver", slow_except(DRIVERS, *DRIVERS[:2]))
 def test_every_driver_finds_the_same_control_points(base, one, solver):
     feet = jf.closest_point(base, POINTS)
     pieces = make_pieces(*(np.asarray(x) for x in (base.control_points, base.knots_u, base.knots_v)))
@@ -144,6 +144,7 @@ def test_without_parameter_correction_the_stall_window_stays_as_given():
     assert (corrected.stall_window, corrected.stall_after) == (20, 20)
 
 
+@pytest.mark.slow
 def test_without_parameter_correction_errors_are_true_distances_inside_jit_too(base):
     method = jf.StandardApproximation(smoothing=SMOOTHING, parameter_correction=False)
     options = dict(tol_average=1e-6, max_steps=1)
@@ -198,6 +199,7 @@ def test_impossible_options_of_a_driver_get_a_sentence(solver, options):
         solver(**options)
 
 
+@pytest.mark.slow
 def test_cross_validation_finds_a_smoothing_that_is_near_the_best(base):
     rng = np.random.default_rng(0)
     noisy = POINTS + 0.01 * rng.normal(size=POINTS.shape)
@@ -228,6 +230,7 @@ def test_a_base_surface_that_follows_noise_does_not_decide_on_lambda():
     assert 0.5 < selected(jf.Meshless()) / selected(jf.Coons()) < 2  # it was 1e-5
 
 
+@pytest.mark.slow
 def test_where_the_base_surface_is_returned_no_lambda_was_in_force(base):
     method = jf.StandardApproximation(smoothing=jf.GeneralizedCrossValidation(rounds=1))
     fit = jf.approximate(POINTS, base, method, tol_average=0.1)

@@ -173,6 +173,7 @@ def test_every_point_can_keep_its_own_parameters():
     assert abs(float(fit.history.maximum[-1]) - float(fit.maximum_error)) <= 2 * eps()
 
 
+@pytest.mark.slow
 def test_derivatives_with_a_parameter_pair_for_every_point():
     direction, cotangent = (random_grid(9, 8, 3, seed) / 20 for seed in (1, 2))
 

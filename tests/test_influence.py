@@ -26,7 +26,7 @@ def base():
     return jf.base_surface(jf.Boundary(**EDGES), net=(7, 6))
 
 
-@pytest.mark.parametrize("name", slow_except(METHODS, "geometric", "standard", "default"))
+@pytest.mark.parametrize("name", slow_except(METHODS, "geometric", "standard"))
 def test_points_of_weight_zero_have_no_influence(base, name):
     # 224 points are padded as 200 are, and share their program; 300 are not.
     count = 100 if name in ("geometric", "default") else 24
@@ -42,7 +42,8 @@ def test_points_of_weight_zero_have_no_influence(base, name):
     assert float(padded.errors[200:].min()) > 0
 
 
-@pytest.mark.parametrize("name", slow_except(["geometric", "orthogonal", "default"], "geometric"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["geometric", "orthogonal", "default"])
 def test_a_batch_of_fits_is_the_fits_one_by_one(base, name):
     clouds = jnp.stack([POINTS, POINTS + 0.01, POINTS * 1.02])
 

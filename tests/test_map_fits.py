@@ -98,7 +98,7 @@ def test_any_executor_computes():
     assert_same(fits, jf.map_fits(CLOUDS, BASE, **OPTIONS))
 
 
-@pytest.mark.parametrize("method", METHODS, ids=name)
+@pytest.mark.parametrize("method", slow_except(METHODS, *METHODS[:2]), ids=name)
 def test_padding_has_no_influence(method):
     def fitted(cloud, weights):
         fit = jf.approximate(cloud, BASE, method, weights=weights, **OPTIONS)

@@ -46,9 +46,7 @@ HOW = {"grad": jax.grad, "vmap": lambda function: lambda x: jax.vmap(function)(j
 
 
 @pytest.mark.parametrize("how", helpers.slow_except(HOW, "grad"))
-@pytest.mark.parametrize(
-    "name", helpers.slow_except(CASES, "closest point", "closest point of a curve", "interpolate")
-)
+@pytest.mark.parametrize("name", helpers.slow_except(CASES, "closest point", "closest point of a curve"))
 def test_a_second_one_compiles_nothing(name, how):
     function, argument = CASES[name]
     first = HOW[how](function)(jnp.asarray(argument))

@@ -99,6 +99,7 @@ def test_the_gradient_of_the_area_is_that_of_finite_differences():
     assert float(jax.grad(area)(0.0)) == pytest.approx(float(expected), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_the_area_in_the_loops_is_that_of_finite_differences():
     surface = wavy_surface()
     loops = jf.TrimmedSurface(surface, LOOPS["an L with two holes"]).loops
