@@ -1,13 +1,14 @@
 """`jax.jit` with the options that make XLA's CPU compiler quick on programs of many small kernels."""
 
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, cached_property, update_wrapper
 from typing import Any
 
 import jax
 import numpy as np
 
 from jaxfit._checks import is_concrete
+from jaxfit._compile_ahead import compile_ahead, wait_for_program
 from jaxfit._kept_programs import call_kept
 
 # XLA's newer emitter of fused CPU kernels takes 1.5 to 1.8 times as long to compile a fit as the older one,
@@ -15,18 +16,20 @@ from jaxfit._kept_programs import call_kept
 OLDER_EMITTER = {"xla_cpu_use_fusion_emitters": False}  # other devices ignore it
 # Level 1 of 3 saves another 10 to 15 % of what compiling takes, for kernels that run 2 to 4 % longer.
 LEVEL = {"xla_backend_optimization_level": 1}
+# Into so many parts, which threads share, a module is cut; 32, as by default, take more time in all.
+PARTS = {"xla_cpu_parallel_codegen_split_count": 8}
 UNKNOWN = "No such compile option"
 
 
 @cache
 def _options() -> dict[str, Any]:
-    """The level is for CPUs only, and for a session that has not told JAX to optimise nothing."""
+    """Those for CPUs only are for a session that has not told JAX to optimise nothing."""
     if jax.default_backend() == "cpu" and not jax.config.read("jax_disable_most_optimizations"):
-        return OLDER_EMITTER | LEVEL
+        return OLDER_EMITTER | PARTS | LEVEL
     return OLDER_EMITTER
 
 
-def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: Any) -> Callable[..., Any]:
+def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: Any) -> "Compiled":
     """`jax.jit(function, **jit_options)` with options quick to compile, where JAX and XLA allow them.
 
     JAX takes compiler options for outermost programs only, so a call with traced arguments is an ordinary
@@ -36,27 +39,44 @@ def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: An
     What takes long to trace is `kept`: if programs are kept on disk, it is loaded from there. It has no
     keyword arguments, and its static ones, in `static_argnums`, are the first.
     """
-    plain = jax.jit(function, **jit_options)
-    known = [True]  # until XLA says that it does not know an option
-    static = np.size(jit_options.get("static_argnums", ()))
+    return Compiled(function, kept, jit_options)
 
-    @cache
-    def quick() -> Any:  # made by the first call, when JAX knows its devices
-        return jax.jit(function, **jit_options, compiler_options=_options())
 
-    @wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        if not known or not is_concrete(args, kwargs):
-            return plain(*args, **kwargs)
+class Compiled:
+    """What `compiled` returns."""
+
+    def __init__(self, function: Callable[..., Any], kept: bool, jit_options: dict[str, Any]):
+        update_wrapper(self, function)
+        self._function = function
+        self._plain = jax.jit(function, **jit_options)
+        self._kept, self._jit_options = kept, jit_options
+        self._static = np.size(jit_options.get("static_argnums", ()))
+        self._options_known = True  # until XLA says that it does not know one
+
+    @cached_property
+    def _quick(self) -> Any:  # made by the first call, when JAX knows its devices
+        return jax.jit(self._function, **self._jit_options, compiler_options=_options())
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if not self._options_known or not is_concrete(args, kwargs):
+            return self._plain(*args, **kwargs)
         try:
             with jax.core.eval_context():
-                if kept:
-                    return call_kept(quick(), static, args)
-                return quick()(*args, **kwargs)
+                if self._kept:
+                    wait_for_program(self._quick, self._static, args)
+                    return call_kept(self._quick, self._static, args)
+                return self._quick(*args, **kwargs)
         except jax.errors.JaxRuntimeError as error:
             if UNKNOWN not in str(error):
                 raise
-            known.clear()
-        return plain(*args, **kwargs)
+            self._options_known = False
+        return self._plain(*args, **kwargs)
 
-    return call
+    def ahead(self, *args: Any) -> None:
+        """Have a thread compile for a call with such arguments, which waits for what is left of that.
+
+        For what is kept, and concrete arguments; their values do not matter.
+        """
+        if self._options_known:
+            with jax.core.eval_context():
+                compile_ahead(self._quick, self._static, args)

@@ -42,10 +42,9 @@ def call_kept(jitted: Any, static: int, args: tuple[Any, ...]) -> Any:
     An ordinary call where no program can be kept: no folder is set, there are several devices, or an argument
     holds what can't be named, such as a function of the user's, which might do something else tomorrow.
     """
-    key = _key(f"{jitted.__module__}.{jitted.__qualname__}", args[:static], args[static:])
-    if folder is None or key is None:
+    path, taken = path_of(jitted, static, args), args[static:]
+    if path is None:
         return jitted(*args)
-    path, taken = folder / f"{jitted.__name__}-{key}{SUFFIX}", args[static:]
     if path not in _loaded and (program := _read(path, taken)) is not None:
         # What XLA can't link, it finds out only when the program runs.
         with contextlib.suppress(jax.errors.JaxRuntimeError):
@@ -53,8 +52,24 @@ def call_kept(jitted: Any, static: int, args: tuple[Any, ...]) -> Any:
             _loaded[path] = program
             return results
     if path not in _loaded:
-        _loaded[path] = _compiled(path, jitted, args)
+        _loaded[path] = _compiled(path, jitted.lower(*args))
     return _loaded[path](*taken)
+
+
+def path_of(jitted: Any, static: int, args: tuple[Any, ...]) -> Path | None:
+    """The file of the program of a call, None if it can't be kept."""
+    key = _key(f"{jitted.__module__}.{jitted.__qualname__}", args[:static], args[static:])
+    return None if folder is None or key is None else folder / f"{jitted.__name__}-{key}{SUFFIX}"
+
+
+def is_kept(path: Path) -> bool:
+    """Whether the program of this file is there."""
+    return path in _loaded or path.exists()
+
+
+def compile_kept(path: Path, lowered: Any) -> None:
+    """Compile for `call_kept`, which then finds the program of this file loaded."""
+    _loaded[path] = _compiled(path, lowered)
 
 
 def _key(name: str, static: tuple[Any, ...], taken: tuple[Any, ...]) -> str | None:
@@ -87,9 +102,9 @@ def _read(path: Path, args: tuple[Any, ...]) -> Any:
     return loaded
 
 
-def _compiled(path: Path, jitted: Any, args: tuple[Any, ...]) -> Any:
+def _compiled(path: Path, lowered: Any) -> Any:
     """The program, compiled now and put into the file, if that is possible."""
-    lowered, before = jitted.lower(*args), _hits_of_jax()[0]
+    before = _hits_of_jax()[0]
     program = lowered.compile()
     if _hits_of_jax()[0] > before:  # what XLA has loaded, it can't write again as a whole on a CPU
         return program

@@ -30,6 +30,6 @@ def as_varying_as(tree: Any, model: Any) -> Any:
 
 
 def varying_axes(x: Any) -> frozenset[str]:
-    """The axes of a mesh over which a value, or the shape of one, varies."""
-    kind = (x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)).manual_axis_type
+    """The axes of a mesh over which a value, or a value of the type `x`, varies."""
+    kind = (x if hasattr(x, "manual_axis_type") else jax.typeof(x)).manual_axis_type
     return frozenset() if kind is None else frozenset(kind.varying)

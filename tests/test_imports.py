@@ -16,6 +16,7 @@ ROOMS = [
     ("_precision", "_progress_line"),
     ("_varying", "_differentiable_once"),
     ("_kept_programs",),
+    ("_compile_ahead",),
     ("_unrolling", "_barrier", "_compile", "_program_folder"),
     ("_splines",),
     ("_parameters",),

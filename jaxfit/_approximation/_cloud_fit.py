@@ -18,6 +18,7 @@ from jaxfit._approximation._implicit_fit import (
     polished_fitted,
     with_implicit_derivative,
 )
+from jaxfit._approximation._programs_ahead import programs_ahead
 from jaxfit._approximation._room import Room, nearest_on
 from jaxfit._approximation._unrolled_fit import unrolled_fit
 from jaxfit._checks import as_points, check_kind, is_concrete, without_derivatives
@@ -67,14 +68,15 @@ def fit_cloud(
     begun = working_surface(base, unit, concrete)
     if room is not None:
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
+    if concrete:
+        programs_ahead(method, problem, begun, cloud.shape[0], request, room)
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, room))
     order = order_by_cell(begun, u, v, cloud.shape[0])
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
     _announce(base.shape, cloud.shape[0], room)
-    entries = max_steps if room is None else room.steps
-    loop = begin(method, together, begun, u[order], v[order], entries)
+    loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
     if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
         _check_derivative(method, together, loop)

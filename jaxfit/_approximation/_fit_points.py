@@ -16,6 +16,7 @@ from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._approximation._growing_net import NetGrowth, fit_growing
 from jaxfit._approximation._level_nets import FIRST_SIZE, BoundaryNets
+from jaxfit._approximation._programs_ahead import programs_of_cloud_ahead
 from jaxfit._base import (
     AbstractBaseMethod,
     Boundary,
@@ -197,11 +198,14 @@ def fit_points(
         request = _DEFAULTS | options | {"throw": False}
         nets = BoundaryNets(boundary, order, np.asarray(cloud))
         growth = NetGrowth(nets.points, nets, default_method(method), request)
+        growth.compile_ahead(order)
         first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, lambda: nets.meshless)
         fit = fit_growing(growth, first)
     else:
         net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
         check_net_of_cloud(net, cloud.shape[0])
+        if is_concrete(method, known):
+            programs_of_cloud_ahead(default_method(method), fixed, net, order, _DEFAULTS | known)
         begun = _base(boundary, fixed, net, order, base)
         fit = approximate(cloud, begun, method, **(options | {"throw": False}))
     if is_concrete(known):

@@ -14,6 +14,7 @@ from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import LocalFeet
 from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, errors_of_neighbours
 from jaxfit._approximation._level_nets import FIRST_SIZE, AbstractNets
+from jaxfit._approximation._programs_ahead import programs_of_cloud_ahead
 from jaxfit._approximation._regular_smoothing import RegularSmoothing
 from jaxfit._approximation._room import Room
 from jaxfit._base import mean_distance_to
@@ -100,11 +101,22 @@ class NetGrowth:
         stage = next((most for most in STAGES if size <= 1.001 * most), size)
         return max(size, min(stage, self.most))
 
+    def _room(self, size: float, shape: tuple[int, int]) -> Room:
+        """What the program has room for that fits a net of this shape."""
+        largest = zip(shape, self.net(self._stage(size)), strict=True)
+        nu, nv = (max(n, -(-most // MULTIPLE) * MULTIPLE) for n, most in largest)
+        return Room((nu, nv), self.request["max_steps"], len(self.points), self.chunk)
+
+    def compile_ahead(self, order: tuple[int, int]) -> None:
+        """Begin to compile the fit of the first net."""
+        net, (some, _) = self.net(FIRST_SIZE), self._chosen(FIRST_SIZE)
+        request = self.request | {"max_steps": min(LEVEL_STEPS, self.request["max_steps"])}
+        room = self._room(FIRST_SIZE, net)
+        programs_of_cloud_ahead(self.method, self.points[some], net, order, request, room)
+
     def fit(self, points: Any, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of `points`, in a program for all nets of the stage and for any number of iterations."""
-        largest = zip(base.shape, self.net(self._stage(size)), strict=True)
-        nu, nv = (max(n, -(-most // MULTIPLE) * MULTIPLE) for n, most in largest)
-        room = Room((nu, nv), self.request["max_steps"], len(self.points), self.chunk)
+        room = self._room(size, base.shape)
         fit = fit_cloud(points, base, self.method, request, room)
         self.steps += int(fit.stats["num_steps"])
         return fit

@@ -14,6 +14,7 @@ from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._iterate_feet import PointSums as PointSums
 from jaxfit._closest._nearest_feet import HostFeet as HostFeet
 from jaxfit._closest._nearest_feet import chunk_size as chunk_size
+from jaxfit._closest._nearest_feet import compile_search_ahead as compile_search_ahead
 from jaxfit._closest._nearest_feet import nearest_feet as nearest_feet
 from jaxfit._closest._project import ParameterBounds as ParameterBounds
 from jaxfit._closest._project import project as project

@@ -20,8 +20,8 @@ from jaxfit._cores import cores
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-CHUNK = 1 << 16
-FEW = 1 << 13  # points at a time where most feet are known
+CHUNK = 1 << 13  # points at a time: one program serves all clouds that have more
+LARGE, LARGE_CHUNK = 1 << 18, 1 << 16  # of such clouds larger chunks take less time
 # The reach costs about as much as the search for so many points a cell.
 LEAST_POINTS_PER_CELL = 24
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
@@ -51,7 +51,7 @@ def nearest_feet(
     `chunk` is how many points are projected at a time; by default that depends on how many there are.
     """
     if chunk is None:
-        chunk = chunk_size(len(points) if known is None else min(len(points), FEW))
+        chunk = chunk_size(len(points) if known is None else min(len(points), CHUNK))
     projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     if start is not None:
         best = projector(None, *start)
@@ -64,6 +64,14 @@ def nearest_feet(
     if "point" in best:
         best["point"] = best["point"].T + projector.centre.astype(net.dtype)[None, :]
     return best
+
+
+def compile_search_ahead(
+    method: AbstractFootMethod, net: Any, axis_u: Axis, axis_v: Axis, count: int, chunk: int | None = None
+) -> None:
+    """Begin to compile what `nearest_feet` takes where the feet of so many points are known."""
+    chunk = chunk or chunk_size(min(count, CHUNK))
+    _Projector(method, net, (axis_u, axis_v), np.zeros((1, net.shape[2])), 0.0, 1, chunk).compile_ahead()
 
 
 @partial(compiled, kept=True, static_argnums=0)
@@ -116,6 +124,13 @@ class _Projector:
         """The surface, made only if there is anything to project."""
         return jax.device_put(pieces_on(self.net.astype(self.dtype), *self.axes))
 
+    def compile_ahead(self) -> None:
+        """Begin to compile the program that the calls take, if that has not been done."""
+        nothing = np.zeros((self.net.shape[2], self.size), self.dtype)
+        idle = np.zeros(self.size, bool)
+        borders = np.asarray(False)
+        _run.ahead(self.method, self.pieces, nothing, nothing[0], nothing[0], idle, *self.limits, borders)
+
     def __call__(self, which: Any, u: Any, v: Any, borders: bool = False) -> HostFeet:
         """Feet of the points `which` (None: all) from (u, v)."""
         self.pieces  # noqa: B018 (before there are threads)
@@ -136,6 +151,7 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
     points = projector.centred.T
     search = None
     if known is None:
+        projector.compile_ahead()  # while SciPy's trees are imported and searched
         search = Search(sample(net.astype(projector.dtype), *axes))
         best = projector(None, *search.nearest(points))
         best = {name: np.array(x) for name, x in best.items()}
@@ -174,8 +190,8 @@ def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, bes
         candidates.found(everywhere_u, everywhere_v)
         take_nearer(best, left[which], other)
     which, u, v = candidates.rest()
-    for begin in range(0, which.size, CHUNK):
-        part = slice(begin, begin + CHUNK)
+    for begin in range(0, which.size, LARGE_CHUNK):
+        part = slice(begin, begin + LARGE_CHUNK)
         chosen = left[which[part]]
         take_nearer(best, chosen, projector(chosen, u[part], v[part]))
 
@@ -201,15 +217,20 @@ def _in_use(axis: Axis, count: int) -> Axis:
 
 
 def chunk_size(count: int) -> int:
-    """The padded size that clouds are cut into: chunks keep the CPU's cores busy and memory in its caches."""
-    most = CHUNK if jax.default_backend() == "cpu" else count
-    return bucket(-(-count // -(-count // most)))
+    """The padded size that clouds are cut into: chunks keep a CPU's cores busy and memory in its caches."""
+    if jax.default_backend() == "cpu" and count > CHUNK:
+        return LARGE_CHUNK if count > LARGE else CHUNK
+    return bucket(count)
 
 
 def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostFeet:
-    """`function` of arrays cut along their last axis, a thread for each core, the results put together."""
+    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core;
+    the results are put together.
+    """
     count = arrays[0].shape[-1]
-    parts = [slice(begin, min(begin + size, count)) for begin in range(0, count, size)]
+    least = -(-count // size)
+    step = -(-count // (-(-least // cores()) * cores() if least > 1 else 1))  # as many parts for every thread
+    parts = [slice(begin, min(begin + step, count)) for begin in range(0, count, step)]
 
     def one(part: slice) -> HostFeet:
         found = function(*(x[..., part] for x in arrays))

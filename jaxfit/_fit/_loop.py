@@ -65,8 +65,7 @@ def run(
     method: AbstractIterativeMethod, problem: Problem, loop: LoopState, progress: Progress | None
 ) -> tuple[LoopState, dict[str, Any]]:
     """The whole loop at once, or with `progress` in chunks of about REPORT_SECONDS."""
-    numbers, rest = dynamic_fields(method)
-    numbers = jax.tree.map(lambda x: np.asarray(x, problem.target.dtype) if is_concrete(x) else x, numbers)
+    rest, numbers = _split(method, problem)
     inputs = (numbers, problem, loop)
     if not is_concrete(inputs):
         numbers, problem, loop = jax.tree.map(jnp.asarray, inputs)
@@ -87,6 +86,22 @@ def run(
         if int(loop.code) != code_of(RESULTS.running):
             return loop, stats
         chunk = max(1, min(2 * chunk, int(chunk * REPORT_SECONDS / max(seconds, 1e-6))))
+
+
+def compile_ahead(
+    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, max_steps: int
+) -> None:
+    """Begin to compile what `run` calls, all concrete. Where the points start does not matter."""
+    somewhere = np.zeros(problem.weight.shape, problem.target.dtype)
+    loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
+    _advance.ahead(*_split(method, problem), problem, problem.tolerances.max_steps, loop)
+
+
+def _split(method: AbstractIterativeMethod, problem: Problem) -> tuple[Any, Any]:
+    """The static fields of a method, and its numbers."""
+    numbers, rest = dynamic_fields(method)
+    numbers = jax.tree.map(lambda x: np.asarray(x, problem.target.dtype) if is_concrete(x) else x, numbers)
+    return rest, numbers
 
 
 @partial(compiled, kept=True, static_argnums=0)

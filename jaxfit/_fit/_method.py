@@ -172,6 +172,11 @@ def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
     return eqx.partition(method, lambda x: isinstance(x, float | np.ndarray | jax.Array))
 
 
+def static_fields(method: AbstractIterativeMethod) -> Any:
+    """The fields that are no traced numbers: a program's, hashable."""
+    return dynamic_fields(method)[1]
+
+
 def check_method(method: Any) -> None:
     """Raise unless the fields that the methods of this library have in common are valid."""
     check_number("stall_window", method.stall_window, 1, whole=True)

@@ -94,3 +94,13 @@ class WorkingSurface(eqx.Module):
         order_u, order_v = self.order
         net, knots_u, knots_v = (np.asarray(x) for x in (self.control_points, self.knots_u, self.knots_v))
         return WorkingSurface.of(net[:nu, :nv], knots_u[: nu + order_u], knots_v[: nv + order_v])
+
+
+def plane(shape: tuple[int, int, int], order: tuple[int, int], dtype: Any) -> WorkingSurface:
+    """A surface with a net of this shape, for what does not depend on the net."""
+    at = [np.linspace(0, 1, n, dtype=dtype) for n in shape[:2]]
+    net = np.zeros(shape, dtype)
+    net[..., 0], net[..., 1] = at[0][:, None], at[1]
+    breaks = [np.linspace(0, 1, n - k + 2, dtype=dtype) for n, k in zip(shape[:2], order, strict=True)]
+    knots_u, knots_v = (np.pad(x, k - 1, "edge") for x, k in zip(breaks, order, strict=True))
+    return WorkingSurface.of(net, knots_u, knots_v)

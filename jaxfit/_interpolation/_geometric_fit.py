@@ -12,10 +12,12 @@ from jax import Array, lax
 
 from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
+from jaxfit._compile_ahead import is_first
 from jaxfit._fit._adjoints import ImplicitAdjoint
-from jaxfit._fit._loop import LoopState, begin, run
+from jaxfit._fit._loop import LoopState, begin, compile_ahead, run
+from jaxfit._fit._method import static_fields
 from jaxfit._fit._problem import Problem, Tolerances
-from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._fit._working_surface import WorkingSurface, plane
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative
 from jaxfit._interpolation._linear_finish import finished_at_grid, with_larger_stall_gain
 from jaxfit._interpolation._method import (
@@ -81,6 +83,11 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
         data = np.asarray(data) if concrete else data
         frame = dataclasses.replace(frame, corners=frame.outward(data[CORNERS]))
     axis = None if symmetry is None else symmetry.axis
+    how = with_larger_stall_gain(method) if concrete and method.solve_stalled else method
+    # Without a derivative no feet need to be remembered.
+    how = dataclasses.replace(how, adjoint=ImplicitAdjoint()) if concrete else how
+    if concrete:
+        _compile_ahead(how, problem.order, data, frame)
     start = make_start(method.parametrisation, method.per_point, problem.order, axis, data)
     if concrete:
         start = jax.tree.map(np.asarray, start)
@@ -90,9 +97,6 @@ def geometric_fit(method: Any, problem: GridProblem, progress: Progress | None) 
     inputs = FitInputs(
         data, start.knots, start.averaged, start.feet, frame.diagonal, frame.goal, foot_tolerance
     )
-    how = with_larger_stall_gain(method) if concrete and method.solve_stalled else method
-    # Without a derivative no feet need to be remembered.
-    how = dataclasses.replace(how, adjoint=ImplicitAdjoint()) if concrete else how
     loop = _iterated(how, inputs if concrete else lax.stop_gradient(inputs), frame.max_steps, progress)
     end, shape = loop.current, data.shape[:2]
     net, here = end.surface.control_points, end.projection
@@ -143,18 +147,37 @@ def _check(method: Any, inner: Any, start: Start, symmetry: Reflection | None) -
         grid_parameters(inner, method.parametrisation)
 
 
-def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress | None) -> LoopState:
-    # Under `grad` outside `jit` they are: `stop_gradient` leaves values. So this says nothing of derivatives.
-    concrete = is_concrete(inputs)
-    xp: Any = np if concrete else jnp
+def _compile_ahead(method: Any, order: tuple[int, int], data: Any, frame: Frame) -> None:
+    """Begin to compile the iteration on a concrete grid, whatever its parameters will be."""
+    dtype, max_steps = np.dtype(data.dtype), int(frame.max_steps)
     method = dataclasses.replace(method, symmetry=None, solve_stalled=False)
+    if not is_first(static_fields(method), order, data.shape, dtype, max_steps):
+        return
+    at_u, at_v = (np.linspace(0, 1, n, dtype=dtype) for n in data.shape[:2])
+    feet = np.broadcast_to(at_u[:, None], data.shape[:2]), np.broadcast_to(at_v, data.shape[:2])
+    flat = plane(data.shape, order, dtype)
+    knots, tolerance = (flat.knots_u, flat.knots_v), np.asarray(method.foot_tolerance, dtype)
+    inputs = FitInputs(data, knots, (at_u, at_v), feet, frame.diagonal, frame.goal, tolerance)
+    compile_ahead(method, *_begun(inputs, frame.max_steps), max_steps)
+
+
+def _begun(inputs: FitInputs, max_steps: Any) -> tuple[Problem, WorkingSurface]:
+    """What is iterated, and the surface that this begins with: the data are its control points."""
+    xp: Any = np if is_concrete(inputs) else jnp
     target = inputs.data.reshape(-1, inputs.data.shape[2]).T
     # The net fixes the size, so points are not padded.
     ones, real = np.ones(target.shape[1], target.dtype), np.ones(target.shape[1], bool)
     far = xp.full_like(inputs.tolerance, np.inf)
     limits = Tolerances(far, inputs.tolerance, max_steps)
     problem = Problem(target, ones, real, inputs.diagonal, xp.ones_like(far), limits)
-    surface = WorkingSurface.of(inputs.data, *inputs.knots, simple=True)
+    return problem, WorkingSurface.of(inputs.data, *inputs.knots, simple=True)
+
+
+def _iterated(method: Any, inputs: FitInputs, max_steps: Any, progress: Progress | None) -> LoopState:
+    # Under `grad` outside `jit` they are: `stop_gradient` leaves values. So this says nothing of derivatives.
+    concrete = is_concrete(inputs)
+    method = dataclasses.replace(method, symmetry=None, solve_stalled=False)
+    problem, surface = _begun(inputs, max_steps)
     u, v = (x.reshape(-1) for x in inputs.feet)
     loop = begin(method, problem, surface, u, v, int(max_steps))
     if method.needs_spectrum:

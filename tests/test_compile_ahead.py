@@ -1,0 +1,68 @@
+"""Programs are compiled by threads ahead of their calls: once, and as the calls will need them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations, wavy_cloud, wavy_grid
+
+import jaxfit as jf
+from jaxfit import _compile
+from jaxfit._compile import compiled
+from jaxfit._compile_ahead import compile_ahead, wait_for_program
+
+X = np.linspace(0.0, 1.0, 7)
+
+
+def made_of(x, factor):
+    return factor * jnp.sin(x) @ jnp.cos(x)
+
+
+def test_the_call_takes_what_was_compiled_ahead():
+    program = compiled(made_of, kept=True)
+    with count_compilations() as found:
+        program.ahead(np.zeros(7), 1.0)
+        program.ahead(np.ones(7), 2.0)
+        result = program(X, 3.0)
+    assert found.count == 1
+    assert float(result) == pytest.approx(3.0 * np.sin(X) @ np.cos(X))
+    with count_compilations() as found:
+        program(np.zeros(8), 1.0)
+    assert found.count > 0
+
+
+def test_what_goes_wrong_in_the_thread_is_raised_by_the_call():
+    impossible = jax.jit(made_of, compiler_options={"xla_of_another_world": True})
+    compile_ahead(impossible, 0, (X, 1.0))
+    wait_for_program(impossible, 0, (X, 1.0))
+    with pytest.raises(jax.errors.JaxRuntimeError, match=_compile.UNKNOWN):
+        impossible(X, 1.0)
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(_compile, "_options", lambda: {"xla_of_another_world": True})
+    program = compiled(made_of, kept=True)
+    program.ahead(X, 1.0)
+    assert float(program(X, 1.0)) == pytest.approx(np.sin(X) @ np.cos(X))
+    program.ahead(X, 2.0)
+
+
+POINTS, BOUNDARY = wavy_cloud(310)[0], jf.Boundary.from_grid(wavy_grid(30, 30))
+CHEBYSHEV = jf.GeometricInterpolation(acceleration=jf.Chebyshev())
+CALLS = {
+    "a net given": lambda: jf.fit_points(POINTS, BOUNDARY, net=(7, 11), max_steps=7),
+    "Meshless": lambda: jf.fit_points(POINTS, BOUNDARY, net=(11, 7), base=jf.Meshless(), order=(3, 4)),
+    "a grid": lambda: jf.interpolate(wavy_grid(13, 5), order=(3, 4)),
+    "Chebyshev": lambda: jf.interpolate(
+        wavy_grid(5, 13), jf.GeometricInterpolation(acceleration=jf.Chebyshev())
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_fits_compile_no_program_in_vain(name):
+    with count_compilations() as found:
+        CALLS[name]()
+    large = [program for program in found.names if "_advance" in program or "_run" in program]
+    assert large
+    assert len(large) == len(set(large))
