@@ -15,6 +15,7 @@ from jaxfit._approximation._implicit_fit import (
     EndOfFit,
     FitInputs,
     Fitted,
+    polish_ahead,
     polished_fitted,
     with_implicit_derivative,
 )
@@ -26,7 +27,7 @@ from jaxfit._closest import closest_point
 from jaxfit._fit._adjoints import ImplicitAdjoint, UnrolledAdjoint
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, run
-from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
+from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields, static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, Name, converged_or_raise
@@ -54,8 +55,7 @@ def fit_cloud(
     check_kind("base", base, BSplineSurface, "base_surface(boundary)")
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
-    cloud = cloud if is_concrete(cloud) else cloud.astype(dtype)
-    given = (cloud, base, method, request)
+    given = (cloud if is_concrete(cloud) else cloud.astype(dtype), base, method, request)
     cloud, base, method, request = without_derivatives(given)
     unit, weight, feet = checked_request(cloud, base.domain, method=method, **request)
     goals, max_steps = (request["tol_average"], request["tol_maximum"]), request["max_steps"]
@@ -79,7 +79,8 @@ def fit_cloud(
     loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
     if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
-        _check_derivative(method, together, loop)
+        values = (cloud, base, method, request)
+        _prepare_derivative(values, _end(together, begun, loop, order, unit, begun), concrete)
     if unrolled:
         first = _end(together, begun, loop, order, unit, begun)
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
@@ -113,10 +114,15 @@ def _nearest(base: BSplineSurface, cloud: Any, room: Room | None) -> tuple[Any, 
     return nearest.u, nearest.v
 
 
-def _check_derivative(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> None:
-    """Have a method that has no implicit derivative say so before the fit, which may take long."""
-    here = loop.current
-    jax.eval_shape(method.stationarity, problem, here.surface, here.state, here.projection.error)
+def _prepare_derivative(values: Any, first: EndOfFit, concrete: bool) -> None:
+    """Have a method that has no implicit derivative say so before the fit, which may take long, and begin to
+    compile what brings the fit to rest; `first` is where it begins.
+    """
+    _, _, method, request = values
+    jax.eval_shape(method.stationarity, first.problem, first.surface, first.state, first.projection.error)
+    if concrete:
+        adjoint = request["adjoint"] or ImplicitAdjoint()
+        polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values))
 
 
 def _end(

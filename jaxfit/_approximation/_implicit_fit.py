@@ -145,11 +145,20 @@ def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: 
     return _fitted_at_rest(rest, at_rest, end, inputs)
 
 
+def polish_ahead(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> None:
+    """Begin to compile what brings a fit to rest, all concrete; `end` is where the fit begins."""
+    polished_fit.ahead(rest, *_limits(adjoint, end), end, inputs)
+
+
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
     """`polished_fit` with the numbers of the adjoint: other ones compile nothing."""
+    return polished_fit(rest, *_limits(adjoint, end), end, lax.stop_gradient(inputs))
+
+
+def _limits(adjoint: ImplicitAdjoint, end: EndOfFit) -> tuple[np.ndarray, np.ndarray]:
+    """The stationarity to reach, and how many Newton steps may be taken."""
     dtype = end.problem.target.dtype
-    goal, most = np.asarray(adjoint.goal(dtype), dtype), np.asarray(adjoint.polish_steps, np.int32)
-    return polished_fit(rest, goal, most, end, lax.stop_gradient(inputs))
+    return np.asarray(adjoint.goal(dtype), dtype), np.asarray(adjoint.polish_steps, np.int32)
 
 
 @partial(compiled, kept=True, static_argnums=0)
