@@ -148,7 +148,7 @@ def closest_point(
     (centres of curvature) the derivative is set to zero.
 
     Outside transformations sizes are padded to one of four per octave, so that clouds of similar size
-    share one compilation. On a CPU, clouds of more than 8,192 points are cut into parts of one size, a
+    share one compilation. On a CPU, clouds of more than 32,768 points are cut into parts of one size, a
     thread for each core.
 
     Examples

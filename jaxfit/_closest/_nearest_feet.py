@@ -20,8 +20,8 @@ from jaxfit._cores import cores
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-CHUNK = 1 << 13  # points at a time: one program serves all clouds that have more
-LARGE, LARGE_CHUNK = 1 << 18, 1 << 16  # of such clouds larger chunks take less time
+CHUNK = 1 << 15  # points at a time: one program serves all clouds that have more
+MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
 # The reach costs about as much as the search for so many points a cell.
 LEAST_POINTS_PER_CELL = 24
 HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
@@ -190,8 +190,8 @@ def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, bes
         candidates.found(everywhere_u, everywhere_v)
         take_nearer(best, left[which], other)
     which, u, v = candidates.rest()
-    for begin in range(0, which.size, LARGE_CHUNK):
-        part = slice(begin, begin + LARGE_CHUNK)
+    for begin in range(0, which.size, MOST_STARTS):
+        part = slice(begin, begin + MOST_STARTS)
         chosen = left[which[part]]
         take_nearer(best, chosen, projector(chosen, u[part], v[part]))
 
@@ -218,9 +218,7 @@ def _in_use(axis: Axis, count: int) -> Axis:
 
 def chunk_size(count: int) -> int:
     """The padded size that clouds are cut into: chunks keep a CPU's cores busy and memory in its caches."""
-    if jax.default_backend() == "cpu" and count > CHUNK:
-        return LARGE_CHUNK if count > LARGE else CHUNK
-    return bucket(count)
+    return CHUNK if jax.default_backend() == "cpu" and count > CHUNK else bucket(count)
 
 
 def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostFeet:
