@@ -4,6 +4,7 @@ XLA compiles without Python's lock: what a fit does on the host, or another prog
 beside it where there is a second core.
 """
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, partial
 from typing import Any
@@ -18,8 +19,9 @@ _coming: dict[Any, Future[Any]] = {}
 
 
 def is_first(*about: Any) -> bool:
-    """Whether this has not been asked before. To tell by that whether there is anything to compile takes less
-    time than to make up the arguments of programs."""
+    """Whether this has not been asked before, which takes less time to find out than a program's arguments to
+    make up.
+    """
     first = about not in _asked
     _asked.add(about)
     return first
@@ -30,7 +32,7 @@ def compile_ahead(jitted: Any, static: int, args: tuple[Any, ...]) -> None:
     the others only types, shapes and dtypes count. Each kind of call is begun once.
     """
     kind = _kind(jitted, static, args)
-    if kind in _begun:
+    if kind in _begun or jax.config.values["jax_disable_jit"]:
         return
     _begun.add(kind)
     path = path_of(jitted, static, args)
@@ -51,6 +53,16 @@ def wait_for_program(jitted: Any, static: int, args: tuple[Any, ...]) -> None:
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2, "jaxfit-compile")
+
+
+def _forget() -> None:
+    """In a forked process, which has none of the threads."""
+    _coming.clear()
+    _threads.cache_clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
 
 
 def _kind(jitted: Any, static: int, args: tuple[Any, ...]) -> Any:

@@ -1,5 +1,7 @@
 """Programs are compiled by threads ahead of their calls: once, and as the calls will need them."""
 
+from concurrent.futures import Future
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +9,10 @@ import pytest
 from helpers import count_compilations, wavy_cloud, wavy_grid
 
 import jaxfit as jf
-from jaxfit import _compile
+from jaxfit import _compile, _compile_ahead
 from jaxfit._compile import compiled
 from jaxfit._compile_ahead import compile_ahead, wait_for_program
+from jaxfit._fit import _loop
 
 X = np.linspace(0.0, 1.0, 7)
 
@@ -60,9 +63,40 @@ CALLS = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_fits_compile_no_program_in_vain(name):
+def test_fits_compile_ahead_and_no_program_in_vain(name, monkeypatch):
+    waited = []
+    monkeypatch.setattr(_compile_ahead, "wait", lambda futures: waited.append(futures[0].result()))
     with count_compilations() as found:
         CALLS[name]()
     large = [program for program in found.names if "_advance" in program or "_run" in program]
-    assert large
-    assert len(large) == len(set(large))
+    assert 0 < len(large) == len(set(large)) == len(waited)
+
+
+def test_a_method_that_takes_no_feet_made_up_is_fitted_all_the_same(monkeypatch):
+    begun, begin = [], _loop.begin
+
+    def not_at_first(*args):
+        begun.append(args)
+        if len(begun) == 1:
+            raise ValueError("not from there")
+        return begin(*args)
+
+    monkeypatch.setattr(_loop, "begin", not_at_first)
+    fit = jf.fit_points(POINTS, BOUNDARY, net=(8, 9), max_steps=3)
+    assert begun
+    assert float(fit.average_error) < 1e-2
+
+
+def test_a_forked_process_waits_for_no_thread_of_its_parent(monkeypatch):
+    monkeypatch.setattr(_compile_ahead, "_coming", {"never": Future()})
+    before = _compile_ahead._threads()
+    _compile_ahead._forget()
+    assert not _compile_ahead._coming
+    assert _compile_ahead._threads() is not before
+    before.shutdown()
+
+
+def test_without_jit_nothing_is_compiled():
+    with count_compilations() as found, jax.disable_jit():
+        compile_ahead(jax.jit(made_of), 0, (X[:5], 1.0))
+    assert found.count == 0

@@ -4,6 +4,7 @@ It ends on a surface that has been measured exactly. It calls methods through th
 `AbstractIterativeMethod` only.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -93,8 +94,11 @@ def compile_ahead(
 ) -> None:
     """Begin to compile what `run` calls, all concrete. Where the points start does not matter."""
     somewhere = np.zeros(problem.weight.shape, problem.target.dtype)
-    loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
-    _advance.ahead(*_split(method, problem), problem, problem.tolerances.max_steps, loop)
+    with contextlib.suppress(
+        Exception
+    ):  # what a method of the user's can't do from there, it will say in `run`
+        loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
+        _advance.ahead(*_split(method, problem), problem, problem.tolerances.max_steps, loop)
 
 
 def _split(method: AbstractIterativeMethod, problem: Problem) -> tuple[Any, Any]:
