@@ -219,6 +219,7 @@ def test_few_points_and_other_wishes_keep_one_net(monkeypatch):
         raise StopIteration
 
     monkeypatch.setattr("jaxfit._approximation._fit_points.approximate", approximate)
+    monkeypatch.setattr("jaxfit._approximation._fit_points.programs_of_cloud_ahead", lambda *_: None)
     inserting = jf.GeometricApproximation(insertion=jf.KnotInsertion(every=50))
     start = tuple(np.full(COUNT, 0.5) for _ in "uv")
     for points, wish in ((CLEAN[:400], {}), (CLEAN, {"method": inserting}), (CLEAN, {"start": start})):

@@ -68,7 +68,7 @@ def fit_cloud(
     begun = working_surface(base, unit, concrete)
     if room is not None:
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
-    if concrete:
+    if concrete and is_concrete(given):  # or else the method may have no derivative
         programs_ahead(method, problem, begun, cloud.shape[0], request, room)
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, room))
     order = order_by_cell(begun, u, v, cloud.shape[0])

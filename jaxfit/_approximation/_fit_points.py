@@ -24,6 +24,7 @@ from jaxfit._base import (
     Meshless,
     base_surface,
     check_net_of_cloud,
+    check_same_place,
     checked_boundary,
     checked_net,
     default_base,
@@ -193,6 +194,7 @@ def fit_points(
         )
     checked_request(fixed, method=without_derivatives(method), **known)
     check_measured("points", np.asarray(fixed), "leave them out, or the boundary, for a raw scan is cleaned")
+    check_same_place(np.asarray(fixed), boundary)
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options | {"throw": False}

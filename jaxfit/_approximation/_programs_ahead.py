@@ -8,7 +8,6 @@ from jaxfit._approximation._errors import GlobalFeet
 from jaxfit._approximation._room import Room
 from jaxfit._closest import Newton, compile_search_ahead
 from jaxfit._compile_ahead import is_first
-from jaxfit._fit._adjoints import UnrolledAdjoint
 from jaxfit._fit._loop import compile_ahead
 from jaxfit._fit._method import AbstractIterativeMethod, static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
@@ -27,10 +26,11 @@ def programs_ahead(
 ) -> None:
     """Begin to compile the search for closest points, if there will be any, and the iteration.
 
-    All is concrete. Nothing is begun for an unrolled fit, which has a program of its own.
+    All is concrete. Nothing is begun where a derivative is asked for: the method may have none, and unrolled
+    fits have a program of their own.
     """
     steps = request["max_steps"] if room is None else room.steps
-    if isinstance(request["adjoint"], UnrolledAdjoint):
+    if request["adjoint"] is not None:
         return
     if not is_first(
         static_fields(method), begun.control_points.shape, problem.target.shape, problem.target.dtype, steps

@@ -33,3 +33,4 @@ from jaxfit._base._meshless import meshless_at as meshless_at
 from jaxfit._base._meshless_parameters import meshless_parameters as meshless_parameters
 from jaxfit._base._net_of_sides import net_of_sides as net_of_sides
 from jaxfit._base._normalised_cloud import cloud_of as cloud_of
+from jaxfit._base._same_place import check_same_place as check_same_place
