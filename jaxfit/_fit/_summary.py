@@ -200,7 +200,8 @@ def said_reason(fit: Any, sentence: str) -> str:
     missed = is_single(fit) and not bool(fit.converged)
     if is_single(fit) and _is_of_cloud(fit) and not missed and not _moves(fit):
         advice = "" if fit.folds else ", which is returned; lower the tolerances for a closer one"
-        sentence = f"{sentence.removesuffix('.')} by the base surface{advice}."
+        first = "base surface" if fit.trimmed is None else "smooth surface that the fit starts from"
+        sentence = f"{sentence.removesuffix('.')} by the {first}{advice}."
     if missed and _is_of_cloud(fit) and fit.result == RESULTS.stalled and not fit.stats["tol_average"]:
         sentence = "the errors have stopped falling."
     if missed and (count := int(fit.stats.get("points_not_finite", 0))):
