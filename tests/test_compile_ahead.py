@@ -56,9 +56,7 @@ CALLS = {
     "a net given": lambda: jf.fit_points(POINTS, BOUNDARY, net=(7, 11), max_steps=7),
     "Meshless": lambda: jf.fit_points(POINTS, BOUNDARY, net=(11, 7), base=jf.Meshless(), order=(3, 4)),
     "a grid": lambda: jf.interpolate(wavy_grid(13, 5), order=(3, 4)),
-    "Chebyshev": lambda: jf.interpolate(
-        wavy_grid(5, 13), jf.GeometricInterpolation(acceleration=jf.Chebyshev())
-    ),
+    "Chebyshev": lambda: jf.interpolate(wavy_grid(5, 13), CHEBYSHEV),
 }
 
 
@@ -70,6 +68,18 @@ def test_fits_compile_ahead_and_no_program_in_vain(name, monkeypatch):
         CALLS[name]()
     large = [program for program in found.names if "_advance" in program or "_run" in program]
     assert 0 < len(large) == len(set(large)) == len(waited)
+
+
+def test_a_method_without_a_derivative_says_so_before_its_loop_compiles():
+    options = dict(net=(7, 10), method=jf.GeometricApproximation.paper(insertion=None), max_steps=9)
+
+    def error(points):
+        return jf.fit_points(points, BOUNDARY, **options).average_error
+
+    with count_compilations() as found, pytest.raises(TypeError, match="has no derivative"):
+        jax.grad(error)(jnp.asarray(POINTS))
+    assert "jit(_advance)" not in found.names
+    assert not _compile_ahead._coming
 
 
 def test_a_method_that_takes_no_feet_made_up_is_fitted_all_the_same(monkeypatch):

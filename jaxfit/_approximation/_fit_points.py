@@ -100,16 +100,15 @@ def fit_points(
         Where the net has grown, `stats` also hold `growth_steps`: iterations with all nets before the last
         fit. With a boundary, outside `jit` and `vmap`, they hold `far_sides`: sides that are far from all
         points, each with its distance as a fraction of the diagonal. Without a boundary they hold
-        `points_read` and of these the
-        number of `non_finite`, `nodata`, `duplicates` and `outliers`, and those `off_the_sheet`; `holes`, the
-        `hole_length` in force, `feet_on_border`: points on the sheet whose foot is on the border of the
-        domain; and `sheet_area`, that of the mesh, near which `trimmed.area()` is. Its vertices are moved
-        along their normals to the mean with their neighbours first, for noise makes a mesh rough and its area
-        too large. `counted` says which points are on the sheet. `trimmed` is the surface cut to the sheet, a
-        `TrimmedSurface`. Points that were left out have errors as well, but do not count; where they are not
-        finite u, v and errors are NaN. A coordinate that stands for no data (nines such as -9999, the ends of
-        16 bits, beyond 1e20) makes a point `nodata`, which counts as not finite, if it is far from all
-        others.
+        `points_read` and of these the number of `non_finite`, `nodata`, `duplicates` and `outliers`, and
+        those `off_the_sheet`; `holes`, the `hole_length` in force, `feet_on_border`: points on the sheet
+        whose foot is on the border of the domain; and `sheet_area`, that of the mesh, near which
+        `trimmed.area()` is. Its vertices are moved along their normals to the mean with their neighbours
+        first, for noise makes a mesh rough and its area too large. `counted` says which points are on the
+        sheet. `trimmed` is the surface cut to the sheet, a `TrimmedSurface`. Points that were left out have
+        errors as well, but do not count; where they are not finite u, v and errors are NaN. A coordinate that
+        stands for no data (nines such as -9999, the ends of 16 bits, beyond 1e20) makes a point `nodata`,
+        which counts as not finite, if it is far from all others.
 
     Raises
     ------
@@ -206,7 +205,7 @@ def fit_points(
     else:
         net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
         check_net_of_cloud(net, cloud.shape[0])
-        if is_concrete(method, known):
+        if is_concrete(cloud, method, options):  # or else the method may have no derivative
             programs_of_cloud_ahead(default_method(method), fixed, net, order, _DEFAULTS | known)
         begun = _base(boundary, fixed, net, order, base)
         fit = approximate(cloud, begun, method, **(options | {"throw": False}))

@@ -226,8 +226,10 @@ def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostF
     the results are put together.
     """
     count = arrays[0].shape[-1]
-    least = -(-count // size)
-    step = -(-count // (-(-least // cores()) * cores() if least > 1 else 1))  # as many parts for every thread
+    number, threads = -(-count // size), cores()
+    if number > 1:  # as many for every thread
+        number = -(-number // threads) * threads
+    step = -(-count // number)
     parts = [slice(begin, min(begin + step, count)) for begin in range(0, count, step)]
 
     def one(part: slice) -> HostFeet:
@@ -236,7 +238,7 @@ def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostF
 
     if len(parts) == 1:
         return one(parts[0])
-    with ThreadPoolExecutor(min(len(parts), cores())) as pool:
+    with ThreadPoolExecutor(min(len(parts), threads)) as pool:
         pieces = list(pool.map(one, parts))
     return {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
 
