@@ -82,6 +82,14 @@ def test_a_method_without_a_derivative_says_so_before_its_loop_compiles():
     assert not _compile_ahead._coming
 
 
+def test_a_grid_without_extent_is_refused_before_its_loop_compiles():
+    flat = np.repeat(wavy_grid(12, 6)[:1], 12, axis=0)
+    with count_compilations() as found, pytest.raises(ValueError, match="grid must extend along its first"):
+        jf.interpolate(flat)
+    assert "jit(_advance)" not in found.names
+    assert not _compile_ahead._coming
+
+
 def test_a_method_that_takes_no_feet_made_up_is_fitted_all_the_same(monkeypatch):
     begun, begin = [], _loop.begin
 

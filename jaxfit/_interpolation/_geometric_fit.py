@@ -151,7 +151,8 @@ def _compile_ahead(method: Any, order: tuple[int, int], data: Any, frame: Frame)
     """Begin to compile the iteration on a concrete grid, whatever its parameters will be."""
     dtype, max_steps = np.dtype(data.dtype), int(frame.max_steps)
     method = dataclasses.replace(method, symmetry=None, solve_stalled=False)
-    if not is_first(static_fields(method), order, data.shape, dtype, max_steps):
+    extent = [np.abs(np.diff(data, axis=k)).max() for k in (0, 1)]
+    if is_flat(extent, data) or not is_first(static_fields(method), order, data.shape, dtype, max_steps):
         return
     at_u, at_v = (np.linspace(0, 1, n, dtype=dtype) for n in data.shape[:2])
     feet = np.broadcast_to(at_u[:, None], data.shape[:2]), np.broadcast_to(at_v, data.shape[:2])
