@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import count_compilations, wavy_cloud, wavy_grid
+from helpers import count_compilations, slow_except, wavy_cloud, wavy_grid
 
 import jaxfit as jf
 from jaxfit import _compile, _compile_ahead
@@ -60,7 +60,7 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", slow_except(CALLS, "a net given", "a grid"))
 def test_fits_compile_ahead_and_no_program_in_vain(name, monkeypatch):
     waited = []
     monkeypatch.setattr(_compile_ahead, "wait", lambda futures: waited.append(futures[0].result()))
@@ -100,7 +100,8 @@ def test_a_method_that_takes_no_feet_made_up_is_fitted_all_the_same(monkeypatch)
         return begin(*args)
 
     monkeypatch.setattr(_loop, "begin", not_at_first)
-    fit = jf.fit_points(POINTS, BOUNDARY, net=(8, 9), max_steps=3)
+    method = jf.StandardApproximation(parameter_correction=False)
+    fit = jf.fit_points(POINTS, BOUNDARY, net=(8, 9), method=method)
     assert begun
     assert float(fit.average_error) < 1e-2
 

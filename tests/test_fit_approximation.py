@@ -389,6 +389,7 @@ def test_a_second_cloud_of_similar_size_compiles_nothing(base):
     assert compiled.count == 0
 
 
+@pytest.mark.slow
 def test_the_whole_way_from_a_cloud_with_its_boundary():
     fit = jf.fit_points(POINTS, BOUNDARY, tol_average=1e-3)
     assert bool(fit.converged), fit.message

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import data, diagonal, eps
+from helpers import data, diagonal, eps, slow_except
 
 import jaxfit as jf
 
@@ -42,7 +42,7 @@ def drooping_nose():
 
 
 @pytest.mark.float32_too
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", slow_except(METHODS, "default"))
 def test_an_extreme_grid_is_met_in_at_most_200_iterations(name):
     grid = fuselage()
     seen = []

@@ -50,7 +50,10 @@ def test_tolerances_of_grids_may_be_traced(method):
 
 @pytest.mark.parametrize(
     ("method", "known"),
-    [(jf.GeometricApproximation(), "weights"), (jf.StandardApproximation(), "points")],
+    [
+        pytest.param(jf.GeometricApproximation(), "weights", marks=pytest.mark.slow),
+        (jf.StandardApproximation(), "points"),
+    ],
     ids=["points", "weights and tolerance"],
 )
 def test_points_weights_and_tolerances_of_clouds_may_be_traced(method, known):

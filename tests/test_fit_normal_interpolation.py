@@ -119,6 +119,7 @@ def test_derivatives_are_those_of_finite_differences():
         assert abs(float(np.sum(np.asarray(slope) * way)) - difference) <= 1e-6 * abs(difference)
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_grids():
     both = np.stack([GRID, 2 * GRID[::-1]])
     normals = np.stack([tilted(), -tilted()[::-1]])

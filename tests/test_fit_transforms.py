@@ -57,6 +57,7 @@ def test_derivatives_are_those_of_finite_differences(method, order):
         np.testing.assert_allclose(jax.grad(pulled)(grid), value(grid)[1], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_implicit_derivative_holds_the_parameters():
     def net(grid):
         method = jf.GeometricInterpolation(adjoint=jf.ImplicitAdjoint())

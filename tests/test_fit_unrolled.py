@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow_except
 
 import jaxfit as jf
 
@@ -149,7 +148,8 @@ def test_a_batch_has_the_derivatives_of_its_clouds():
         np.testing.assert_allclose(found, gradient(points), rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("name", slow_except(METHODS, "standard"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 def test_the_fit_differs_little_from_one_without_a_derivative(name):
     options = {"tol_average": None, "tol_maximum": 1e-9, "max_steps": 4}
     plain, followed = (
