@@ -71,7 +71,7 @@ def fit_cloud(
     if concrete and is_concrete(given):  # or else the method may have no derivative
         programs_ahead(method, problem, begun, cloud.shape[0], request, room)
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, room))
-    order = order_by_cell(begun, u, v, cloud.shape[0])
+    order = order_by_cell(begun, u, v, cloud.shape[0], method.finds_feet)
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
@@ -202,13 +202,17 @@ def _padded(x: Any, size: int, dtype: Any) -> Any:
     return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])]) if size > x.shape[0] else x
 
 
-def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int) -> Any:
+def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int, often: bool = True) -> Any:
     """The points sorted by cell, the `count` true ones first.
 
-    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster.
+    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster. Sorting does
+    not pay unless that is done `often`: points on the host then keep their order.
     """
     axis_u, axis_v = surface.axes
-    xp: Any = np if is_concrete(surface.axes, u, v) else jnp
+    concrete = is_concrete(surface.axes, u, v)
+    if concrete and not often:
+        return np.arange(u.shape[0])
+    xp: Any = np if concrete else jnp
     cells = axis_u.cells * axis_v.cells
     cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)
     if u.shape[0] > count:

@@ -14,7 +14,7 @@ from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
     stationarity_residual,
 )
-from jaxfit._cells import values_at
+from jaxfit._cells import distances_at
 from jaxfit._closest import Newton
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._method import AbstractIterativeMethod
@@ -154,6 +154,5 @@ def _measured(
     if method.finds_feet:
         tolerance = default_foot_tolerance(problem.target.dtype)
         return measure_feet(Newton(), problem, surface.pieces, before, tolerance)
-    residual = values_at(surface.pieces, before.u, before.v) - problem.target
-    distance = jnp.sqrt(jnp.sum(jnp.where(problem.real[None], residual, 0.0) ** 2, axis=0))
+    distance = distances_at(surface.pieces, before.u, before.v, problem.target, problem.real)
     return eqx.tree_at(lambda p: p.error, before, distance)

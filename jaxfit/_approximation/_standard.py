@@ -14,7 +14,7 @@ from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewt
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
 from jaxfit._approximation._unrolled_solution import unrolled_solution
-from jaxfit._cells import values_at
+from jaxfit._cells import distances_at
 from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
@@ -26,7 +26,7 @@ from jaxfit._fit._projection import Projection
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import RegularisedSystem, ThinPlate, WeightedPlate, make_system
-from jaxfit._unrolling import root, unrolled
+from jaxfit._unrolling import unrolled
 
 
 class StandardState(eqx.Module):
@@ -166,12 +166,11 @@ class StandardApproximation(AbstractIterativeMethod):
         """Feet on the new surface, or without correction the errors at the same parameters."""
         if self.parameter_correction:
             return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
-        idle = ~jnp.asarray(problem.real)
-        error = values_at(surface.pieces, before.u, before.v) - problem.target
-        distance = root(jnp.sum(jnp.where(idle[None], 0.0, error) ** 2, axis=0))
+        real = jnp.asarray(problem.real)
+        distance = distances_at(surface.pieces, before.u, before.v, problem.target, real)
         active = jnp.sum(problem.counted, dtype=jnp.int32)
         return Projection(
-            *(before.u, before.v, distance, before.evaluations, ~idle, active, jnp.asarray(True)),
+            *(before.u, before.v, distance, before.evaluations, real, active, jnp.asarray(True)),
             before.summary,
         )
 

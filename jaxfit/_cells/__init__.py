@@ -3,6 +3,7 @@
 from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
 from jaxfit._cells._blocks import over_blocks as over_blocks
 from jaxfit._cells._layout import cells_of as cells_of
+from jaxfit._cells._layout import distances_at as distances_at
 from jaxfit._cells._layout import local_coordinates as local_coordinates
 from jaxfit._cells._layout import row_coefficients as row_coefficients
 from jaxfit._cells._layout import rows_of as rows_of

@@ -1,5 +1,6 @@
 """Rows laid over the pieces of a spline: which cell a point is in, and what a row needs of its cell."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from jaxfit._cells._polynomials import PARTIALS, polynomial_partials
 from jaxfit._cells._rows import Rows, make_rows
 from jaxfit._splines._evaluate import in_blocks
 from jaxfit._splines._pieces import Pieces
+from jaxfit._unrolling import root
 
 
 def cells_of(pieces: Pieces, u: Any, v: Any) -> Any:
@@ -53,20 +55,39 @@ def local_coordinates(
 def values_at(
     pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"]
 ) -> Float[Array, "d points"]:
-    """Points on the surface, each with its own cell's polynomial.
+    """Points on the surface, each with its own cell's polynomial."""
+    return in_blocks(_values_of(pieces), u, v).T
 
-    Every coefficient is fetched where it is needed, for a block of points at a time.
-    """
+
+def distances_at(
+    pieces: Pieces,
+    u: Float[Array, " points"],
+    v: Float[Array, " points"],
+    target: Float[Array, "d points"],
+    real: Bool[Array, " points"],
+) -> Float[Array, " points"]:
+    """How far the targets are from the surface at (u, v), 0 for those that are not `real`."""
+    values = _values_of(pieces)
+
+    def distances(u: Array, v: Array, real: Array, *target: Array) -> Float[Array, " points"]:
+        error = jnp.where(real[:, None], values(u, v) - jnp.stack(target, axis=1), 0.0)
+        return root(jnp.sum(error**2, axis=1))
+
+    return in_blocks(distances, u, v, real, *target)
+
+
+def _values_of(pieces: Pieces) -> Callable[[Array, Array], Float[Array, "points d"]]:
+    """The surface as a function of parameters, which fetches a cell's polynomial for each point."""
     pieces = jax.tree.map(jnp.asarray, pieces)
     d, order_u, order_v = pieces.coefficients.shape[1:]
-    terms, coefficients = order_u * order_v, pieces.coefficients.reshape(-1)
+    terms = order_u * order_v
+    by_cell = pieces.coefficients.reshape(pieces.cells, d * terms)
 
     def values(u: Array, v: Array) -> Float[Array, "points d"]:
         cell = cells_of(pieces, u, v)
         s, t = local_coordinates(pieces, cell, u, v)
-        number = jnp.arange(d * terms, dtype=cell.dtype).reshape(d, terms).T[..., None]
-        flat = take(coefficients, cell[None, None] * (d * terms) + number, 0)
-        each = [x[0] for x in lax.split(flat, (1,) * terms)]
-        return polynomial_partials(each, order_v, s[None], t[None], PARTIALS[:1])[0].T
+        own = take(by_cell, cell, 0).reshape(-1, d, terms)
+        each = [x[..., 0] for x in lax.split(own, (1,) * terms, 2)]
+        return polynomial_partials(each, order_v, s[:, None], t[:, None], PARTIALS[:1])[0]
 
-    return in_blocks(values, u, v).T
+    return values

@@ -9,6 +9,7 @@ $[0, 1]^2$ whatever the knots.
 """
 
 import math
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -94,6 +95,7 @@ def _roots(axis: Axis) -> Any:
     return xp.einsum("dga,ira,di->dgir", monomials, axis.polynomials, scale)
 
 
+@cache
 def _monomials(order: int) -> Float[np.ndarray, "3 g order"]:
     """Derivatives of s^a at Gauss points, times the roots of the weights."""
     points, weights = np.polynomial.legendre.leggauss(order)

@@ -1,12 +1,15 @@
 """Tensor-product B-spline surfaces."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jaxfit._checks import is_concrete
 from jaxfit._splines import _geometry
 from jaxfit._splines._basis import as_parameters
 from jaxfit._splines._bezier import BezierPatches, bezier_along
@@ -20,8 +23,6 @@ from jaxfit._splines._curve import BSplineCurve, affine_image
 from jaxfit._splines._evaluate import contract, evaluate_grid, evaluate_surface
 from jaxfit._splines._insertion import insert_in_net
 from jaxfit._splines._knots import greville_abscissae
-
-Interval = tuple[Float[Array, ""], Float[Array, ""]]
 
 
 class BSplineSurface(eqx.Module):
@@ -102,10 +103,11 @@ class BSplineSurface(eqx.Module):
         return self.control_points.shape[-1]
 
     @property
-    def domain(self) -> tuple[Interval, Interval]:
-        """First and last parameter along u, and along v."""
+    def domain(self) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
+        """First and last parameter along u, and along v: NumPy's numbers unless knots are traced."""
         K, L = self.order
-        return (self.knots_u[K - 1], self.knots_u[-K]), (self.knots_v[L - 1], self.knots_v[-L])
+        u, v = (np.asarray(x) if is_concrete(x) else x for x in (self.knots_u, self.knots_v))
+        return (u[K - 1], u[-K]), (v[L - 1], v[-L])
 
     def __call__(self, u: ArrayLike, v: ArrayLike, *, extrapolate: bool = False) -> Float[Array, "*shape d"]:
         """Points at the pairs (u, v); the two broadcast against each other."""
