@@ -54,7 +54,10 @@ def on_page_content(content, **_):
 
     def drawn(found):
         display = "block" if found[1] == "div" else "inline"
-        return convert(html.unescape(found[2]), display=display)
+        formula = convert(html.unescape(found[2]), display=display)
+        if "\\" in formula:
+            raise ValueError(f"a formula has a command that cannot be drawn: {found[2]}")
+        return formula
 
     return FORMULA.sub(drawn, content)
 

@@ -28,7 +28,8 @@ def execute(path, write):
     """Run one notebook in a kernel of its own, and say how long that took."""
     book = nbformat.read(path, as_version=4)
     begun = time.perf_counter()
-    NotebookClient(book, timeout=600, resources={"metadata": {"path": str(HERE)}}).execute()
+    where = {"metadata": {"path": str(HERE)}}
+    NotebookClient(book, timeout=600, resources=where, coalesce_streams=True).execute()  # a table: one output
     print(f"{path.name}: {time.perf_counter() - begun:.0f} s", flush=True)
     if write:
         for cell in book.cells:

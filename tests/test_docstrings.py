@@ -26,6 +26,7 @@ SOURCE = re.compile(
     r"\bpapers?\b|[Ee]quations? \(|[Ss]ection \d|NURBS Book|Source: |\b(19|20)\d\d\b|Algorithm 1|Box I"
 )
 MATHEMATICS = re.compile(r"\$.+\$|\.\. math::", re.DOTALL)
+NOT_MARKDOWN = re.compile(r"^={3,} +=|^\.\. \w+::", re.MULTILINE)  # the site shows them raw
 CONSTRUCTION = ("__init__", "__check_init__", "__post_init__", "__new__")
 
 
@@ -53,6 +54,14 @@ def entries(section):
     }
 
 
+def joined(section, arguments):
+    """Names that share an entry but no default: the site shows the default of the first for all of them."""
+    for names in ENTRY.split(section)[1::3]:
+        named = [arguments[name] for name in names.split(", ") if name in arguments]
+        if len({(x.kind is x.VAR_KEYWORD, repr(x.default)) for x in named}) > 1:
+            yield names
+
+
 def checks_arguments(value):
     """Whether the function, or the making of the object, raises or calls a check."""
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(value))).body
@@ -74,6 +83,8 @@ def lacks(value):
     parts = sections(text)
     if not text:
         yield "docstring"
+    if NOT_MARKDOWN.search(text):
+        yield "Markdown"
     if ">>>" not in parts.get("Examples", ""):
         yield "example"
     if is_plain(value):
@@ -83,6 +94,8 @@ def lacks(value):
         told |= entries(parts.get(title, ""))
     arguments = inspect.signature(value).parameters
     yield from (f"word on {x}" for x in arguments if x not in told)
+    if not inspect.isclass(value):
+        yield from (f"entries of their own for {x}" for x in joined(parts.get("Parameters", ""), arguments))
     kinds = {name: words.splitlines()[0] for name, words in told.items() if "As for" not in words}
     arrays = {x.name for x in arguments.values() if "Array" in str(x.annotation)} | {
         name for name, kind in kinds.items() if "array" in kind

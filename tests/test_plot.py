@@ -243,13 +243,22 @@ def test_loops_and_history_are_drawn(tmp_path):
     axes = loops(fit, tmp_path / "l.png").axes[0]
     said = [text.get_text() for text in axes.get_legend().get_texts()]
     inside = int(np.asarray(fit.inside).sum())
-    assert said == [f"{inside} points inside", f"{500 - inside} points outside"]
+    assert said == [f"{inside} points inside", f"{500 - inside} points outside or left out"]
     errors = np.array([1e-2, 1e-3, 1e-4])
     fit.history = SimpleNamespace(average=errors, maximum=3 * errors)
     fit.stats["num_steps"] = 2
     axes = history(fit, tmp_path / "h.png").axes[0]
     np.testing.assert_allclose(axes.lines[0].get_ydata(), 300 * errors)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["h.png", "l.png"]
+
+
+def test_few_points_outside_the_loops_are_drawn_all_and_large_enough_to_see():
+    fit = trimmed_fit(30_000)
+    fit.inside = np.ones(30_000, bool)
+    fit.inside[[7, 20_001]] = False
+    within, outside = loops(fit).axes[0].collections
+    assert len(outside.get_offsets()) == 2
+    assert np.sqrt(outside.get_sizes()[0]) > 3 > np.sqrt(within.get_sizes()[0])  # points across
 
 
 def test_a_surface_with_fewer_samples_than_pixels_has_no_gaps(monkeypatch):

@@ -47,11 +47,13 @@ def approximate(
         Any `AbstractIterativeMethod`. Default OrthogonalDistance(), which comes closest in the fewest
         iterations and makes no new folds; one of GeometricApproximation(), the paper's, takes a fraction of
         its time. The fit's `stats["method"]` is the name.
-    tol_average, tol_maximum : float or None
-        The fit has converged when the average and the maximum error are at most these fractions of the
-        diagonal of the data's bounding box. None sets no limit; not both may be None. With 0.0 a fit goes
-        on until its errors stop falling: compare nets or methods so. Default: 6e-4 (the paper's 0.06 %) on
-        average, no limit on the maximum.
+    tol_average : float or None
+        The fit has converged when the average error is at most this fraction of the diagonal of the data's
+        bounding box, and the maximum error at most `tol_maximum`. None sets no limit; not both may be None.
+        With 0.0 a fit goes on until its errors stop falling: compare nets or methods so. Default: 6e-4, the
+        paper's 0.06 %.
+    tol_maximum : float or None
+        The same of the maximum error (default None, no limit).
     max_steps : int
         The largest number of iterations (default 200).
     weights : array (points,), optional

@@ -89,7 +89,9 @@ def fit_points(
         In the unit of the points: no triangle is longer, so gaps that are wider are holes. Only without a
         boundary. Default: twice the distance of the sixth neighbour, of 99 % of the points; given faces are
         all kept.
-    method, options
+    method : GeometricApproximation(), OrthogonalDistance(), StandardApproximation() or your own, optional
+        As for `approximate`.
+    options
         As for `approximate`: tol_average (default 6e-4) and tol_maximum (default none), fractions of the
         diagonal: 6e-4 is 0.06 %; max_steps, weights, start, progress, throw, errors, adjoint. Without a
         boundary there are no `start` and no `adjoint`.

@@ -46,7 +46,7 @@ def map_fits(
     clouds : list of arrays (points, d), array (fits, points, d), or one array (points, d)
         They may differ in size. Each may be what `jaxfit.io.read_points` has read.
     base : BSplineSurface, or a list of them
-    method : a method of `approximate`, or a list of them, optional
+    method : one of those of approximate, or a list of them, optional
         So are lambdas given: ``[jf.StandardApproximation(smoothing=x) for x in lambdas]``.
     weights : list of arrays (points,), array (fits, points), or one array (points,), optional
     executor : concurrent.futures.Executor, optional

@@ -94,7 +94,7 @@ def closest_point(
     tolerance: float | None = None,
     max_steps: int = 60,
 ) -> ClosestPoint:
-    r"""Foot points: $\arg\min_{u,v} |Q_k - R(u, v)|$ over the domain, for every point $Q_k$.
+    r"""Foot points: $\operatorname{argmin}_{u,v} |Q_k - R(u, v)|$ over the domain, for every point $Q_k$.
 
     Parameters
     ----------

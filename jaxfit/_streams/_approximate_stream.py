@@ -50,12 +50,22 @@ def approximate_stream(
     method : StandardApproximation() or GeometricApproximation(), optional
         Default StandardApproximation(), which needs the fewest passes. Without insertion, `local=True` and
         lambda chosen from the data; a loss needs its scale, as in ``jf.Huber(1e-3)``.
-    tol_average, tol_maximum, max_steps, progress, throw, errors
-        As for `approximate`. Each iteration is one pass over the points, and so is each call of `progress`.
+    tol_average : float or None
+        As for `approximate`.
+    tol_maximum : float or None
+        As for `approximate`.
+    max_steps : int
+        As for `approximate`. Each iteration is one pass over the points.
     weights : array (points,), optional
         The non-negative weight of each point (default 1), in the order of the source; may be a mapped file.
     start : pair of arrays (points,), optional
         Feet (u, v) on the base surface to start from; default the closest points, searched globally.
+    progress : callable, optional
+        As for `approximate`; called once an iteration.
+    throw : bool
+        As for `approximate`.
+    errors : GlobalFeet(), LocalFeet() or AtParameters(), optional
+        As for `approximate`.
     block_size : int
         The number of points at a time (default 262,144). One program is compiled for it. Up to four cores of
         a CPU work on a block each.

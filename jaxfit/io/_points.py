@@ -25,28 +25,22 @@ _LEAST_POINTS = 4
 def read_points(path: str | os.PathLike) -> PointData:
     """Read scattered points or a grid, and the border if the file holds one.
 
-    ==================  ===========================================================
-    suffix              content
-    ==================  ===========================================================
-    ``.npz``            ``grid`` (n, m, 3), or ``points`` (N, 3) with or without
-                        ``boundary_v0``, ``boundary_v1``, ``boundary_u0``,
-                        ``boundary_u1`` (see `jaxfit.Boundary`); other keys are
-                        ignored, and so are ``points`` beside a ``grid``
-    ``.npy``            one array, (N, 3) scattered or (n, m, 3) grid
-    ``.csv``            scattered, one point a line, commas or semicolons; a first
-                        line may hold names
-    ``.xyz``, ``.txt``  the same with blanks instead of commas
-    ``.ply``, ``.stl``  the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
-    ``.obj``, ``.off``  ``.off`` without faces (trimesh)
-    ``.las``, ``.laz``  a survey, with the scale and offset of the file (laspy, lazrs)
-    ``.e57``            all scans, in the frame of the file (pye57)
-    ``.pcd``            fields x, y and z (pypcd4)
-    ==================  ===========================================================
+    - ``.npz``: ``grid`` (n, m, 3), or ``points`` (N, 3) with or without ``boundary_v0``, ``boundary_v1``,
+      ``boundary_u0``, ``boundary_u1`` (see `jaxfit.Boundary`); other keys are ignored, and so are ``points``
+      beside a ``grid``
+    - ``.npy``: one array, (N, 3) scattered or (n, m, 3) grid
+    - ``.csv``: scattered, one point a line, commas or semicolons; a first line may hold names
+    - ``.xyz``, ``.txt``: the same with blanks instead of commas
+    - ``.ply``, ``.stl``, ``.obj``, ``.off``: the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
+      ``.off`` without faces (trimesh)
+    - ``.las``, ``.laz``: a survey, with the scale and offset of the file (laspy, lazrs)
+    - ``.e57``: all scans, in the frame of the file (pye57)
+    - ``.pcd``: fields x, y and z (pypcd4)
 
     Columns after the third are ignored everywhere, blank lines and lines that begin with ``#``
     in text files. Coordinates become float64; units and large offsets stay as they are.
 
-    The formats of the last four rows need the extra ``scan``. Some of them say of points that they are no
+    Those that name a library need the extra ``scan``. Some of them say of points that they are no
     measurements, by a flag or by NaN, and meshes may repeat a vertex (STL: in every triangle). Such points
     are left out and counted in `PointData.left_out`. In NumPy's and text files NaN is an error.
 

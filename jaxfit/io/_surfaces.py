@@ -30,24 +30,16 @@ def write_surface(
 ) -> Float[np.ndarray, " d"]:
     """Write a surface, trimmed or not, or that of a fit; the file appears whole or not at all.
 
-    ==================  ===========================================================
-    suffix              content
-    ==================  ===========================================================
-    ``.npz``            arrays ``control_points`` (nu, nv, d), ``knots_u``,
-                        ``knots_v`` and ``order`` (2,), in the surface's own
-                        precision; of loops ``loop_vertices`` (k, 2), one after
-                        another, and ``loop_counts``, how many each has
-    ``.json``           geomdl's exchange format (``geomdl.exchange.import_json``);
-                        geomdl scales knots to [0, 1] when it reads them; loops
-                        are freeform trims, in the knots of the file
-    ``.step``, ``.stp`` one face of a B-spline surface, AP214 (OCP), whose edges
-                        are the loops
-    ``.iges``, ``.igs`` one trimmed surface (OCP), by default the whole surface
-    ``.3dm``            Rhino's format, exact, without a unit (rhino3dm); loops
-                        are curves beside the whole surface
-    ``.ply``, ``.stl``  triangles within 0.01 % of the diagonal, ``.ply`` and
-    ``.obj``            ``.stl`` in single precision (trimesh)
-    ==================  ===========================================================
+    - ``.npz``: arrays ``control_points`` (nu, nv, d), ``knots_u``, ``knots_v`` and ``order`` (2,), in the
+      surface's own precision; of loops ``loop_vertices`` (k, 2), one after another, and ``loop_counts``, how
+      many each has
+    - ``.json``: geomdl's exchange format (``geomdl.exchange.import_json``); geomdl scales knots to [0, 1]
+      when it reads them; loops are freeform trims, in the knots of the file
+    - ``.step``, ``.stp``: one face of a B-spline surface, AP214 (OCP), whose edges are the loops
+    - ``.iges``, ``.igs``: one trimmed surface (OCP), by default the whole surface
+    - ``.3dm``: Rhino's format, exact, without a unit (rhino3dm); loops are curves beside the whole surface
+    - ``.ply``, ``.stl``, ``.obj``: triangles within 0.01 % of the diagonal, ``.ply`` and ``.stl`` in single
+      precision (trimesh)
 
     All but the first two need the extra ``cad`` and a surface in three dimensions. Coordinates are written
     as they are, whatever their unit; STEP and IGES must name one, and say millimetres.

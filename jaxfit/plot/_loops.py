@@ -13,11 +13,13 @@ from jaxfit.plot._picture import blank_figure, draw_loops, save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MOST_POINTS = 20_000  # drawn; of more every so many
+_MOST_POINTS = 20_000  # drawn of each kind; of more every so many
 
 
 def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi: int = 150) -> "Figure":
     """One picture of the parameters (u, v): the loops, the knots, and the points inside and outside.
+
+    Points that the fit left out are red, too, wherever their feet are.
 
     Parameters
     ----------
@@ -57,20 +59,23 @@ def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi:
     u, v = (np.asarray(x, float).reshape(-1) for x in (fit.u, fit.v))
     trimmed = getattr(fit, "trimmed", None)
     inside = np.ones(u.size, bool) if trimmed is None else np.asarray(fit.inside).reshape(-1)
-    every = -(-u.size // _MOST_POINTS)
-    for mask, colour, label in ((inside, "0.45", "inside"), (~inside, "tab:red", "outside")):
+    kinds = ((inside, "0.45", 2.0, "inside"), (~inside, "tab:red", 12.0, "outside or left out"))
+    for mask, colour, size, label in kinds:
         if mask.any():
             style: dict[str, Any] = {
-                "s": 2.0,
+                "s": size,
                 "linewidths": 0,
                 "color": colour,
                 "label": f"{int(mask.sum()):,} points {label}",
             }
+            every = -(-int(mask.sum()) // _MOST_POINTS)
             axes.scatter(u[mask][::every], v[mask][::every], **style)
     draw_loops(axes, trimmed)
     axes.set_xlabel("u")
     axes.set_ylabel("v")
-    axes.legend(loc="upper right", fontsize=8, framealpha=0.9, markerscale=4)
+    handles: Any = axes.legend(loc="upper right", fontsize=8, framealpha=0.9).legend_handles
+    for handle in handles:
+        handle.set_sizes([32.0])
     if title:
         figure.suptitle(title, fontsize=14, fontweight="bold")
     if path is not None:
