@@ -33,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     are those in ``jaxfit fit --help``.
     With the process's own arguments it ends the process.
     """
+    if argv is None:
+        _interrupt.last_calls.append(_interrupted)
     code = _run(argv)
     if argv is None:
         # At once: taking the interpreter down costs a second, and crashes where a computation still runs.
@@ -46,7 +48,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     started = time.perf_counter()
     try:
-        _interrupt.restore_ctrl_c()
         args = argument_parser().parse_args(argv)
         show_no_line()
         with warnings.catch_warnings():
@@ -57,7 +58,7 @@ def _run(argv: Sequence[str] | None) -> int:
                 return batch_command(args)
             return _fit_command(args, started)
     except KeyboardInterrupt:
-        return _fail("interrupted, nothing more is written.", INTERRUPTED)
+        return _interrupted()
     except (ValueError, TypeError, OSError, ImportError) as error:  # an extra may be missing
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
@@ -66,6 +67,10 @@ def _run(argv: Sequence[str] | None) -> int:
         traceback.print_exc()
         defect = f"{type(error).__name__}: {error}"
         return _fail(f"the fit failed; please report this defect with the lines above: {defect}", FAILED)
+
+
+def _interrupted() -> int:
+    return _fail("interrupted, nothing more is written.", INTERRUPTED)
 
 
 def _fail(sentence: object, code: int) -> int:

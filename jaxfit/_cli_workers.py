@@ -6,9 +6,11 @@ All three take jobs as executors of `concurrent.futures` do; what differs is how
 import contextlib
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from functools import partial
 from typing import Any, TypeVar
 
 from jaxfit._batch._worker_processes import end_processes, started_processes
+from jaxfit._interrupt import at_last
 from jaxfit.io import InputError
 
 Done = TypeVar("Done")
@@ -98,12 +100,9 @@ class Cluster:
 def chosen_pool(workers: int, scheduler: str | None) -> Iterator[Any]:
     """The executor that the arguments ask for."""
     pool: Any = Cluster(scheduler) if scheduler else Processes(workers) if workers > 1 else Here()
-    try:
+    with at_last(partial(pool.shutdown, at_once=True)):
         yield pool
-    except BaseException:
-        pool.shutdown(at_once=True)
-        raise
-    pool.shutdown()
+        pool.shutdown()
 
 
 class Schedule:

@@ -15,6 +15,7 @@ from functools import wraps
 from typing import Any
 
 from jaxfit._checks import is_concrete
+from jaxfit._interrupt import at_last
 
 SETTING = "JAXFIT_PROGRESS"  # "off" in the environment shows nothing
 OFF, BAR = "off", "bar"  # the latter where the command shows a bar of its own
@@ -79,14 +80,18 @@ def _line_of(phase: str) -> Iterator[None]:
         return
     line = _Line(phase)
     thread = threading.Thread(target=line.watch, daemon=True)
-    try:
-        _lines.append(line)
-        thread.start()
-        yield
-    finally:
+
+    def end() -> None:
         _lines.clear()
         line.ended.set()
         thread.join()  # the line is gone before anything else is printed
+
+    try:
+        with at_last(end):
+            _lines.append(line)
+            thread.start()
+            yield
+    finally:
         _one_line.release()
 
 
