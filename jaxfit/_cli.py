@@ -16,7 +16,7 @@ from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
 from jaxfit._cli_page import write_page
-from jaxfit._cli_report import as_sentence, print_table, progress_bar
+from jaxfit._cli_report import as_sentence, print_table
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
 from jaxfit._fit._summary import facts
 from jaxfit.io._output import PICTURES
@@ -49,7 +49,8 @@ def _run(argv: Sequence[str] | None) -> int:
     started = time.perf_counter()
     try:
         args = argument_parser().parse_args(argv)
-        show_no_line()
+        if args.quiet or args.command == "batch":  # which says what is done
+            show_no_line()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             if args.command == "batch":
@@ -86,9 +87,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     data, chosen = read(args)
     if picture:  # while the fit is compiled, which leaves Python idle
         threading.Thread(target=_load_matplotlib, daemon=True).start()
-    task = FitOfFile(chosen, data)
-    with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
-        done = task.run(progress)
+    done = FitOfFile(chosen, data).run()
     offset = io.write_surface(args.output, fitted_surface(done.fit))
     if picture:
         from jaxfit.plot import surface_and_errors

@@ -87,10 +87,10 @@ class FitOfFile:
                 "give one by --boundary."
             )
 
-    def run(self, progress: Any = None) -> FittedFile:
+    def run(self) -> FittedFile:
         """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""
         before = time.perf_counter()
-        fit = self._fit(progress)
+        fit = self._fit()
         average, maximum = float(fit.average_error), float(fit.maximum_error)
         seconds = time.perf_counter() - before
         if not (math.isfinite(average) and math.isfinite(maximum)):
@@ -120,9 +120,9 @@ class FitOfFile:
         given = {"tol_average": self.args.tol_average, "tol_maximum": self.args.tol_maximum}
         return {name: value for name, value in given.items() if value is not None}
 
-    def _fit(self, progress: Any) -> Any:
+    def _fit(self) -> Any:
         args, data = self.args, self.data
-        options: dict[str, Any] = {"order": args.order, "progress": progress, **self.options}
+        options: dict[str, Any] = {"order": args.order, **self.options}
         if args.max_steps is not None:
             options["max_steps"] = args.max_steps
         tolerances = {name: value / 100 for name, value in self._asked().items()}

@@ -23,8 +23,6 @@ def fits(monkeypatch):
             calls.made.append((name, data, args, options))
             if calls.fails:
                 raise calls.fails
-            if options["progress"]:
-                options["progress"](3, 10, calls.average, calls.maximum)
             count = np.asarray(data).reshape(-1, 3).shape[0]
             u, v = np.random.default_rng(0).uniform(size=(2, count))
             return SimpleNamespace(
@@ -135,13 +133,11 @@ def test_options_arrive_as_fractions(fits, folder):
         "tol_average": pytest.approx(2e-4),
         "tol_maximum": pytest.approx(5e-3),
         "max_steps": 7,
-        "progress": None,
     }
     assert run("grid.npz", "--tol-average", "0.1", "--tol-maximum", "0.01") in (0, 1)
     assert fits.made[1][3] == {
         "order": (4, 4),
         "tolerance": pytest.approx(1e-4),
-        "progress": None,
     }
     assert run("cloud.npz", "--order", "3") == 0
     assert fits.made[2][3]["order"] == (3, 3)
@@ -151,7 +147,7 @@ def test_points_without_boundary_are_fitted_without(fits, folder):
     assert run("bare.xyz", "--hole-length", "0.25") == 0
     _, points, arguments, options = fits.made[0]
     assert (points.shape, arguments) == ((60, 3), (None,))
-    assert set(options) == {"order", "progress", "net", "faces", "hole_length"}
+    assert set(options) == {"order", "net", "faces", "hole_length"}
     assert (options["faces"], options["hole_length"]) == (None, 0.25)
 
 
@@ -408,16 +404,6 @@ def test_quiet_is_silent(fits, folder, capsys):
     assert run("cloud.npz", "--quiet") == 0
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
-
-
-def test_progress_goes_to_a_terminal_only(fits, folder, capsys, monkeypatch):
-    run("cloud.npz")
-    assert fits.made[-1][3]["progress"] is None
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    run("cloud.npz")
-    assert fits.made[-1][3]["progress"] is not None
-    run("cloud.npz", "--quiet")
-    assert fits.made[-1][3]["progress"] is None
 
 
 def test_the_picture_lies_beside_the_surface(fits, folder):
