@@ -423,6 +423,23 @@ def test_without_matplotlib_there_is_no_picture(fits, folder, capsys, monkeypatc
     assert "jaxfit-surfaces[plot]" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["fit", "batch"])
+def test_the_help_has_all_exit_codes(capsys, command):
+    with pytest.raises(SystemExit):
+        _cli.main([command, "--help"])
+    codes = capsys.readouterr().out.split("exit codes:\n")[1].split("\n\n")[0]
+    assert [line.split()[0] for line in codes.splitlines()] == ["0", "1", "2", "3", "130"]
+
+
+def test_the_help_trims_no_3dm(capsys):
+    with pytest.raises(SystemExit):
+        _cli.main(["fit", "--help"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if ".3dm" in line]
+    assert len(lines) == 1
+    assert "the whole surface" in lines[0]
+    assert "trimmed" not in lines[0]
+
+
 @pytest.mark.parametrize("argv", [["--help"], ["fit", "--help"], ["--version"]])
 def test_help_and_version(capsys, argv):
     with pytest.raises(SystemExit) as caught:
