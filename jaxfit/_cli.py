@@ -106,7 +106,8 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        print_table({**read_from, **facts(done.fit), "tolerances": done.tolerances, **outcome})
+        said = {"tolerances": done.tolerances, "stopped": done.message}
+        print_table({**read_from, **facts(done.fit), **said, **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 

@@ -6,11 +6,23 @@ from collections.abc import Mapping
 
 # Options that sentences of the library name as in Python; not as a part of a file's name.
 _IN_PYTHON = re.compile(r"(?<![\w./\\-])(hole_length|tol_average|tol_maximum|max_steps)(?![\w-]|[./\\]\w)")
+REWORDED = {  # what else they say in Python
+    " (fit.regularity.fold_parameters)": "",
+    "StandardInterpolation()": "--method interpolate-standard",
+    "border=FreeBorder()": "--border free",
+    "a method with loss=Tukey()": "--loss tukey",
+    "by fit_points, as a cloud": "by --method approximate",
+    "work in float64 (the flag jax_enable_x64 of jax.config)": "leave out --float32",
+    "switch on double precision, the flag jax_enable_x64 of jax.config": "leave out --float32",
+    "switch on jax_enable_x64": "leave out --float32",
+}
 
 
 def as_sentence(error: object) -> str:
-    """What went wrong in one line, its options by the names they have on the command line."""
+    """What the library says in one line, its options by the names they have on the command line."""
     line = " ".join(str(error).split())
+    for python, reworded in REWORDED.items():
+        line = line.replace(python, reworded)
     return _IN_PYTHON.sub(lambda found: "--" + found[1].replace("_", "-"), line)
 
 

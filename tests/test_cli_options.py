@@ -1,10 +1,11 @@
 """What the command line hands to the fit, shows, and returns; the fit itself is faked here."""
 
+import ast
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import wavy_cloud, wavy_grid, wavy_surface
+from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit
 from jaxfit import _cli, _cli_report, plot
@@ -17,6 +18,7 @@ def fits(monkeypatch):
     calls = SimpleNamespace(
         made=[], average=1e-5, maximum=1e-4, converged=True, fails=None, trimmed=None, stats={}
     )
+    calls.surface, calls.message = wavy_surface(), "The errors are within their tolerances."
 
     def fake(name):
         def fit(data, *args, **options):
@@ -26,15 +28,15 @@ def fits(monkeypatch):
             count = np.asarray(data).reshape(-1, 3).shape[0]
             u, v = np.random.default_rng(0).uniform(size=(2, count))
             return SimpleNamespace(
-                surface=wavy_surface(),
-                regularity=jaxfit.regularity(wavy_surface()),
+                surface=calls.surface,
+                regularity=jaxfit.regularity(calls.surface),
                 u=u,
                 v=v,
                 errors=np.full(count, calls.average),
                 average_error=calls.average,
                 maximum_error=calls.maximum,
                 converged=calls.converged,
-                message="The errors are within their tolerances.",
+                message=calls.message,
                 stats={"num_steps": 3, "diagonal": 1.0, **calls.stats},
                 trimmed=calls.trimmed,
                 inside=np.full(count, True),
@@ -391,6 +393,34 @@ def test_the_table_says_the_tolerances_in_force(fits, folder, capsys, argv, said
     run(*argv.split())
     row = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("tolerances"))
     assert row.removeprefix("tolerances").strip() == said
+
+
+@pytest.mark.parametrize(
+    ("argv", "folds", "asked"),
+    [
+        ("bare.xyz --grid 6x10", True, ", or is the grid 10x6?"),
+        ("bare.xyz --grid 6x10", False, "."),
+        ("grid.npz", True, "."),
+    ],
+)
+def test_where_a_grid_folds_its_sides_are_asked_for(fits, folder, capsys, argv, folds, asked):
+    if folds:
+        net = fits.surface.control_points
+        fits.surface = jaxfit.BSplineSurface(
+            net[:, ::-1].at[:3].set(net[:3]), fits.surface.knots_u, fits.surface.knots_v
+        )
+    fits.message = "it folds: look whether its points are in order (fit.regularity.fold_parameters)."
+    assert run(*argv.split(), "--tol-average", "1") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"it folds: look whether its points are in order{asked} tolerances" in said
+
+
+def test_what_is_reworded_for_the_command_line_is_said_somewhere():
+    sources = [path.read_text() for path in (CHECKOUT / "jaxfit").rglob("*.py") if path.stem != "_cli_report"]
+    nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
+    texts = [str(node.value) for node in nodes if isinstance(node, ast.Constant)]
+    for python in _cli_report.REWORDED:
+        assert any(python in text for text in texts), python
 
 
 def test_sentences_name_options_as_on_the_command_line(fits, folder, capsys):
