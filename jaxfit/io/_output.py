@@ -42,13 +42,14 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = _SURFACES)
     surface.xyz has the suffix .xyz, so its format is not known; use one of .npz, .json.
     """
     path = Path(path)
+    if path.is_dir():
+        file = path / f"surface{'.step' if '.step' in suffixes else suffixes[0]}"
+        raise InputError(f"{path} is a folder; name a file in it, such as {file}.")
     if path.suffix.lower() not in suffixes:
         raise InputError(
             f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, so "
             f"its format is not known; use one of {', '.join(suffixes)}."
         )
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file in it.")
     part = _part(path)
     if not part.parent.is_dir():
         raise InputError(f"the folder {part.parent} does not exist; make it first.")
