@@ -1,5 +1,6 @@
 """What would mislead a fit is refused in a sentence, before anything is computed or allocated."""
 
+import dataclasses
 import inspect
 import io
 import os
@@ -441,6 +442,17 @@ def test_a_printed_fit_tells_its_errors(fit):
         assert said in str(fit)
     assert "\n" not in repr(fit)
     assert "8 x 7 control points, average error" in repr(fit)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "more"),
+    [({}, False), ({"nodata": 1, "non_finite": 1}, False), ({"nodata": 2, "outliers": 1}, True)],
+)
+def test_errors_of_points_left_out_are_printed_where_there_are_any(fit, left_out, more):
+    errors = fit.errors.at[0, :2].set(np.nan if left_out else 0.0)
+    scan = dataclasses.replace(fit, errors=errors, stats=fit.stats | {"points_read": 56} | left_out)
+    assert (" of the diagonal, of the points that count" in str(scan)) == bool(left_out)
+    assert ("all points" in str(scan)) == more
 
 
 def test_a_fit_without_values_prints_its_shapes(fit):
