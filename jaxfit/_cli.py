@@ -127,7 +127,7 @@ def _check_files(args: argparse.Namespace) -> str | None:
         return None
     if not drawable and (args.picture is not None or args.report):
         raise io.InputError(
-            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+            'pictures need Matplotlib, which is not installed; pip install "jaxfit-surfaces[plot]".'
         )
     if not drawable:
         return None

@@ -69,7 +69,7 @@ class Cluster:
         except ImportError as error:
             raise InputError(
                 "--scheduler needs Dask's distributed, which is not installed; pip install "
-                "'jaxfit-surfaces[cluster]'."
+                '"jaxfit-surfaces[cluster]".'
             ) from error
         try:
             self._client = Client(address, timeout=_CONNECT, set_as_default=False)

@@ -139,7 +139,7 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
         (["a.npz", "-o", "a.npz"], "cannot be made"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
-        (["a.npz", "--scheduler", "tcp://x"], "pip install 'jaxfit-surfaces[cluster]'"),
+        (["a.npz", "--scheduler", "tcp://x"], 'pip install "jaxfit-surfaces[cluster]"'),
         ([], "FILE"),
     ],
 )

@@ -302,7 +302,7 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["batch", "cloud.npz", "-o", "new", "--no-picture"], "--no-picture; see jaxfit batch --help"),
         (["fit", "none.npz", "-o", "s.npz"], "none.npz does not exist"),
         (["fit", "bare.xyz", "-o", "s.npz", "--method", "interpolate"], "cannot be interpolated"),
-        (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "7 x 7 grid of 49"),
+        (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "bare.xyz holds 60 points, which do not"),
         (["fit", "bare.xyz", "-o", "s.npz", "--boundary", "grid.npz"], "holds no boundary"),
         (["fit", "grid.npz", "-o", "s.npz", "--method", "interpolate", "--net", "5x5"], "--net"),
         (["fit", "cloud.npz", "-o", "s.dwg"], "suffix .dwg"),
