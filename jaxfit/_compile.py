@@ -62,8 +62,8 @@ class Compiled:
             return self._plain(*args, **kwargs)
         try:
             with jax.core.eval_context():
+                wait_for_program(self._quick, self._static, args)
                 if self._kept:
-                    wait_for_program(self._quick, self._static, args)
                     return call_kept(self._quick, self._static, args)
                 return self._quick(*args, **kwargs)
         except jax.errors.JaxRuntimeError as error:
@@ -75,8 +75,13 @@ class Compiled:
     def ahead(self, *args: Any) -> None:
         """Have a thread compile for a call with such arguments, which waits for what is left of that.
 
-        For what is kept, and concrete arguments; their values do not matter.
+        For concrete arguments without keywords; their values do not matter.
         """
         if self._options_known:
             with jax.core.eval_context():
-                compile_ahead(self._quick, self._static, args)
+                compile_ahead(self._quick, self._static, args, self._kept)
+
+    def like_result(self, *args: Any) -> Any:
+        """Zeros in the place of what a call with such arguments returns."""
+        with jax.core.eval_context():
+            return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), self._quick.eval_shape(*args))

@@ -27,15 +27,16 @@ def is_first(*about: Any) -> bool:
     return first
 
 
-def compile_ahead(jitted: Any, static: int, args: tuple[Any, ...]) -> None:
+def compile_ahead(jitted: Any, static: int, args: tuple[Any, ...], kept: bool = True) -> None:
     """Begin to compile `jitted` for a call with such arguments, of which the first `static` are static: of
-    the others only types, shapes and dtypes count. Each kind of call is begun once.
+    the others only types, shapes and dtypes count. Each kind of call is begun once. What is not `kept` is
+    never on disk.
     """
     kind = _kind(jitted, static, args)
     if kind in _begun or jax.config.values["jax_disable_jit"]:
         return
     _begun.add(kind)
-    path = path_of(jitted, static, args)
+    path = path_of(jitted, static, args) if kept else None
     if path is not None and is_kept(path):
         return
     lowered = jitted.lower(*args)  # here, where JAX's settings are those of the caller

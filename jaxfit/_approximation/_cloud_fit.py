@@ -79,8 +79,8 @@ def fit_cloud(
     loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
     if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
-        values = (cloud, base, method, request)
-        _prepare_derivative(values, _end(together, begun, loop, order, unit, begun), concrete)
+        first = _end(together, begun, loop, order, unit, begun)
+        _prepare_derivative((cloud, base, method, request), first, concrete, not is_concrete(given))
     if unrolled:
         first = _end(together, begun, loop, order, unit, begun)
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
@@ -114,7 +114,7 @@ def _nearest(base: BSplineSurface, cloud: Any, room: Room | None) -> tuple[Any, 
     return nearest.u, nearest.v
 
 
-def _prepare_derivative(values: Any, first: EndOfFit, concrete: bool) -> None:
+def _prepare_derivative(values: Any, first: EndOfFit, concrete: bool, differentiated: bool) -> None:
     """Have a method that has no implicit derivative say so before the fit, which may take long, and begin to
     compile what brings the fit to rest; `first` is where it begins.
     """
@@ -122,7 +122,7 @@ def _prepare_derivative(values: Any, first: EndOfFit, concrete: bool) -> None:
     jax.eval_shape(method.stationarity, first.problem, first.surface, first.state, first.projection.error)
     if concrete:
         adjoint = request["adjoint"] or ImplicitAdjoint()
-        polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values))
+        polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values), differentiated)
 
 
 def _end(

@@ -6,6 +6,7 @@ polished, and the derivative is that of the polished surface in the inputs.
 """
 
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
+from jaxfit._approximation._newton_system import NewtonSystem
 from jaxfit._approximation._polish import PolishedFit, polished
 from jaxfit._approximation._stationarity_residual import (
     StationarityResidual,
@@ -41,6 +43,9 @@ from jaxfit._splines._lookup import windows
 ACCURACY = 0.75
 TRUSTED = 1e-3  # a greater |G|, relative to its terms, is of no surface near rest,
 RELIABLE = 1e-6  # and from this one on digits are lost
+
+LinearMap = Callable[[Any], tuple[Array, "Fitted"]]
+Residual = Callable[[Array, "FitInputs"], tuple[Array, "Fitted"]]
 
 
 class FitInputs(eqx.Module):
@@ -145,9 +150,16 @@ def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: 
     return _fitted_at_rest(rest, at_rest, end, inputs)
 
 
-def polish_ahead(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> None:
-    """Begin to compile what brings a fit to rest, all concrete; `end` is where the fit begins."""
-    polished_fit.ahead(rest, *_limits(adjoint, end), end, inputs)
+def polish_ahead(
+    rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs, differentiated_too: bool
+) -> None:
+    """Begin to compile what brings a fit to rest, and the derivative there, all concrete; `end` is where the
+    fit begins.
+    """
+    args = (rest, *_limits(adjoint, end), end, inputs)
+    polished_fit.ahead(*args)
+    if differentiated_too:
+        _linearised.ahead(rest, polished_fit.like_result(*args), end, inputs)
 
 
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
@@ -177,26 +189,53 @@ def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: Fit
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit as a function of the inputs."""
-    return _implicit(rest, at_rest, end, inputs, None)[0]
+    return _fitted(rest, at_rest, end, inputs)
 
 
 @_fitted_at_rest.defjvp
 def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
-    return _implicit(rest, at_rest, end, differentiated(inputs), tangents[2])
+    fitted, maps = _linearised(rest, at_rest, end, differentiated(inputs))
+    return fitted, _along(maps, at_rest.system, tangents[2])
 
 
 @partial(compiled, kept=True, static_argnums=0)
-def _implicit(
-    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs, change: FitInputs | None
-) -> tuple[Fitted, Fitted | None]:
-    """The polished fit, and its derivative along a `change` of the inputs."""
-    at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
-    here = at_rest.projection
-    surface = end.surface.moved_to(at_rest.net)
-    system = at_rest.system
+def _fitted(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
+    """The polished fit."""
+    return _residual_at_rest(rest, at_rest, end)(at_rest.net, inputs)[1]
 
-    def at(net: Array, inputs: FitInputs) -> tuple[Array, Fitted]:
+
+@partial(compiled, static_argnums=0)
+def _linearised(
+    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs
+) -> tuple[Fitted, tuple[LinearMap, LinearMap]]:
+    """The polished fit; and G with the fit as linear maps, of changes of the inputs and of the net.
+
+    All that the derivative needs of the points is computed here, once for both modes.
+    """
+    residual, net = _residual_at_rest(rest, at_rest, end), at_rest.net
+    (_, fitted), along_inputs = jax.linearize(partial(residual, net), inputs)
+    _, along_net = jax.linearize(lambda net: residual(net, inputs), net)
+    return fitted, (along_inputs, along_net)
+
+
+@jax.jit
+def _along(maps: tuple[LinearMap, LinearMap], system: NewtonSystem, change: FitInputs) -> Fitted:
+    """The derivative along a change of the inputs."""
+    along_inputs, along_net = maps
+    right, held = along_inputs(change)
+    accuracy = float(jnp.finfo(right.dtype).eps) ** ACCURACY
+    move = system.solved_differentiably(lambda x: along_net(x)[0], -right, accuracy)
+    return jax.tree.map(jnp.add, held, along_net(move)[1])
+
+
+def _residual_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit) -> Residual:
+    """G, and the fit, as functions of the net and the inputs."""
+    at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
+    here, system = at_rest.projection, at_rest.system
+    surface = end.surface.moved_to(at_rest.net)
+
+    def residual(net: Array, inputs: FitInputs) -> tuple[Array, Fitted]:
         method = eqx.combine(inputs.numbers, rest)
         problem, still = problem_of(end, inputs), base_net_of(end, inputs)
         u, v = (here.u, here.v) if method.finds_feet else given_feet_of(end, inputs)
@@ -205,14 +244,7 @@ def _implicit(
         found = stationarity_residual(*args, system.free, still)
         return found.value, _outward(end, inputs, at_rest, net, found)
 
-    if change is None:
-        return at(at_rest.net, inputs)[1], None
-    (_, fitted), along_inputs = jax.linearize(partial(at, at_rest.net), inputs)
-    _, along_net = jax.linearize(lambda net: at(net, inputs), at_rest.net)
-    right, held = along_inputs(change)
-    accuracy = float(jnp.finfo(at_rest.net.dtype).eps) ** ACCURACY
-    move = system.solved_differentiably(lambda x: along_net(x)[0], -right, accuracy)
-    return fitted, jax.tree.map(jnp.add, held, along_net(move)[1])
+    return residual
 
 
 def _outward(

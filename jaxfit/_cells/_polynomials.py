@@ -49,8 +49,8 @@ def _along_rows(coefficients: Array, s: Array, t: Array, partials: Sequence[tupl
 def polynomial_partials(
     coefficients: Sequence[Array],
     order_v: int,
-    s: Float[Array, "1 ..."],
-    t: Float[Array, "1 ..."],
+    s: Float[Array, "..."],
+    t: Float[Array, "..."],
     partials: Sequence[tuple[int, int]],
 ) -> list[Array]:
     """Derivatives of sum_ab c_ab s^a t^b; the coefficients are in row-major order and broadcast against s."""
