@@ -78,10 +78,13 @@ def test_named_columns_of_whole_numbers_are_no_decimal_commas(tmp_path):
 def test_a_column_that_counts_the_points_is_refused(tmp_path, first, name):
     delimiter = "," if name == "a.csv" else " "
     numbered = np.column_stack([np.arange(first, first + 60), POINTS])
-    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="n,a,b,c", comments="")
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="my scan", comments="")
     with pytest.raises(InputError, match=f"{name}: the first column only counts the points") as error:
         read_points(tmp_path / name)
-    assert "remove it" in sentence(error)
+    assert "remove it, or name the columns x, y and z in the first line" in sentence(error)
+    header = delimiter.join("xyzw")
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header=header, comments="")
+    np.testing.assert_array_equal(read_points(tmp_path / name).points, numbered[:, :3])
     np.savetxt(tmp_path / name, numbered[:, [1, 2, 3, 0]], delimiter=delimiter)
     np.testing.assert_array_equal(read_points(tmp_path / name).points, POINTS)
 
