@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxfit._base import Boundary
 from jaxfit._checks import said_missing
 from jaxfit.io._arrays import load_arrays
-from jaxfit.io._point_data import InputError, PointData, grid_data
+from jaxfit.io._point_data import MOST_COLUMNS, InputError, PointData, grid_data
 from jaxfit.io._scans import SCANS, read_scan
 from jaxfit.io._text import read_columns
 
@@ -147,6 +147,11 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
     shape, ndim = ("(n, m, 3)", 3) if key == "grid" else ("(N, 3)", 2)
     if key == "points" and array.ndim == 2 and len(array) == 3 and array.shape[1] > _LEAST_POINTS:
         raise InputError(f"{path}: points has shape {array.shape}; it must be (N, 3): store the transpose.")
+    if key == "points" and array.ndim == 2 and array.shape[1] > MOST_COLUMNS:
+        raise InputError(
+            f"{path}: points has shape {array.shape}; it must be (N, 3), or a grid (n, m, 3) if these are "
+            "heights."
+        )
     array = _coordinates(array, key, ndim, shape, path)
     if array.size < 3 * _LEAST_POINTS:
         raise InputError(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit.io._point_data import InputError
+from jaxfit.io._point_data import MOST_COLUMNS, InputError
 
 FIRST = 0, 1, 2
 _SAID = 8  # names of columns in a sentence
@@ -45,6 +45,11 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     named = _axes(names)
     if named is None or (named != FIRST and delimiter is None and len(names) > found):
         _check_names(path, names, found)
+        if found > MOST_COLUMNS:
+            raise InputError(
+                f"{path} has {found} columns without names; give one point x,y,z a line, or name the "
+                "columns, or write the heights as a grid (n, m, 3) in .npy."
+            )
         named = None
     columns = named or FIRST
     try:
