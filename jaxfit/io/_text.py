@@ -142,13 +142,20 @@ def _explain(
     """The sentence for the first line that cannot be read (NumPy counts other lines)."""
     for number, line in lines:
         cells = line.split("#")[0].split(delimiter)
-        if len(cells) <= max(columns):
+        short = len(cells) <= max(columns)
+        wrong = [] if short else [x for x in (cells[k] for k in columns) if not _is_number(x)]
+        if not (short or wrong):
+            continue
+        if line is lines[0][1] and any(_is_header(x) for _, x in lines[:2]):
+            return (
+                f"{path}: line {number} is no point, and only one line of names may come first; put # before "
+                "the others."
+            )
+        if short:
             hint, least = _DELIMITERS[delimiter], max(columns) + 1
             return (
                 f"{path}: line {number} has {len(cells)} column{'s' * (len(cells) != 1)}, but a "
                 f"point has {'three' if least == 3 else least}; separate x, y and z by {hint}."
             )
-        for cell in (cells[column] for column in columns):
-            if not _is_number(cell):
-                return f"{path}: line {number} has {cell.strip()!r} in place of a number; mend it."
+        return f"{path}: line {number} has {wrong[0].strip()!r} in place of a number; mend it."
     return f"{path} is not a table of numbers; write one point a line."
