@@ -341,6 +341,14 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
             lambda: inspect.unwrap(as_floating)("points", PointData(POINTS, None, None, "a"), 2),
             "points must be an array, but is a PointData; pass its .cloud or .grid",
         ),
+        (
+            lambda: inspect.unwrap(as_floating)("points", None, 2),
+            r"points must be an array, but is None; .* pass data itself, or data\.grid\.reshape\(-1, 3\)\.",
+        ),
+        (
+            lambda: inspect.unwrap(as_floating)("grid", None, 3),
+            r"grid must be an array, but is None; .* pass data\.as_grid\(n, m\), or fit data by fit_points\.",
+        ),
         *(
             (
                 lambda call=call, args=args: inspect.unwrap(call)(*args),
