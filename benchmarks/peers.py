@@ -17,7 +17,7 @@ from benchmarks import _inputs
 from benchmarks._referee import distances, judged
 from benchmarks._timing import in_turns
 
-ALL_PEERS = "pip install splinepy splipy pygismo geomdl cvxopt '.[cad]'"
+ALL_PEERS = 'pip install splinepy splipy pygismo geomdl cvxopt ".[cad]"'
 MOST_GEOMDL = 2_000  # points: it takes seconds for more
 CASES = ((3_000, 11, 15), (11_500, 42, 42), (100_000, 62, 57))
 

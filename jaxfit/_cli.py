@@ -16,7 +16,7 @@ from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
 from jaxfit._cli_page import write_page
-from jaxfit._cli_report import as_sentence, print_table, progress_bar
+from jaxfit._cli_report import as_sentence, print_table
 from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
 from jaxfit._fit._summary import facts
 from jaxfit.io._output import PICTURES
@@ -33,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     are those in ``jaxfit fit --help``.
     With the process's own arguments it ends the process.
     """
+    if argv is None:
+        _interrupt.last_calls.append(_interrupted)
     code = _run(argv)
     if argv is None:
         # At once: taking the interpreter down costs a second, and crashes where a computation still runs.
@@ -46,9 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     started = time.perf_counter()
     try:
-        _interrupt.restore_ctrl_c()
         args = argument_parser().parse_args(argv)
-        show_no_line()
+        if args.quiet or args.command == "batch":  # which says what is done
+            show_no_line()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             if args.command == "batch":
@@ -57,7 +59,7 @@ def _run(argv: Sequence[str] | None) -> int:
                 return batch_command(args)
             return _fit_command(args, started)
     except KeyboardInterrupt:
-        return _fail("interrupted, nothing more is written.", INTERRUPTED)
+        return _interrupted()
     except (ValueError, TypeError, OSError, ImportError) as error:  # an extra may be missing
         return _fail(error, BAD_INPUT)
     except (RuntimeError, ArithmeticError, MemoryError) as error:
@@ -66,6 +68,10 @@ def _run(argv: Sequence[str] | None) -> int:
         traceback.print_exc()
         defect = f"{type(error).__name__}: {error}"
         return _fail(f"the fit failed; please report this defect with the lines above: {defect}", FAILED)
+
+
+def _interrupted() -> int:
+    return _fail("interrupted, nothing more is written.", INTERRUPTED)
 
 
 def _fail(sentence: object, code: int) -> int:
@@ -81,9 +87,7 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     data, chosen = read(args)
     if picture:  # while the fit is compiled, which leaves Python idle
         threading.Thread(target=_load_matplotlib, daemon=True).start()
-    task = FitOfFile(chosen, data)
-    with progress_bar(show=not args.quiet and sys.stderr.isatty()) as progress:
-        done = task.run(progress)
+    done = FitOfFile(chosen, data).run()
     offset = io.write_surface(args.output, fitted_surface(done.fit))
     if picture:
         from jaxfit.plot import surface_and_errors
@@ -102,7 +106,8 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
     if args.report:
         write_page(args, data, done, read_from, outcome)
     if not args.quiet:
-        print_table({**read_from, **facts(done.fit), "tolerances": done.tolerances, **outcome})
+        said = {"tolerances": done.tolerances, "stopped": done.message}
+        print_table({**read_from, **facts(done.fit), **said, **outcome})
     return REACHED if done.reached else NOT_REACHED
 
 
@@ -122,7 +127,7 @@ def _check_files(args: argparse.Namespace) -> str | None:
         return None
     if not drawable and (args.picture is not None or args.report):
         raise io.InputError(
-            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+            'pictures need Matplotlib, which is not installed; pip install "jaxfit-surfaces[plot]".'
         )
     if not drawable:
         return None

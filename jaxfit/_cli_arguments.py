@@ -21,7 +21,8 @@ INPUT   .npz  'grid' (n, m, 3), or 'points' (N, 3) with 'boundary_v0', 'boundary
         jacksboro       the terrain inside Matplotlib
 OUTPUT  .npz  control_points, knots_u, knots_v, order; loops of a trimmed surface
         .json geomdl's exchange format
-        .step .stp .iges .igs .3dm  for CAD, trimmed where the rim was found
+        .step .stp .iges .igs  for CAD, trimmed where the rim was found
+        .3dm  for Rhino: the whole surface, and as curves the rim and the holes that were found
         .ply .stl .obj  triangles
 """
 _EPILOG = """\
@@ -30,6 +31,7 @@ exit codes:
   1  written, but a tolerance that was given was not reached (a missed default shows in the table only)
   2  bad input or usage, or a file cannot be written
   3  the fit failed numerically, nothing is written; or jaxfit has a defect, which a traceback shows
+  130  interrupted, nothing more is written
 
 environment:
   JAXFIT_CACHE_DIR  as --cache; empty or "off" is --no-cache
@@ -50,6 +52,7 @@ exit codes:
   1  all fitted, but a tolerance that was given was not reached by some
   2  bad usage, or the folder cannot be written
   3  some files failed: their rows and stderr say why
+  130  interrupted; the table has the files that were done
 
 With --scheduler the workers read FILES and write FOLDER under the same paths, and have jaxfit.
 """

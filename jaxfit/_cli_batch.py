@@ -9,6 +9,7 @@ from jaxfit._cli_batch_file import Job, failed, fit_file, job_of, size_of
 from jaxfit._cli_fit import read_and_written
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row, Table
 from jaxfit._cli_workers import Schedule, chosen_pool
+from jaxfit._interrupt import at_last
 
 _CODES = {FITTED: 0, MISSED: 1, FAILED: 3}
 
@@ -57,14 +58,11 @@ def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
 
 
 def _fit_all(args: argparse.Namespace, jobs: list[Job], table: Table) -> None:
-    try:
-        with chosen_pool(args.workers, args.scheduler) as pool:
-            done = Schedule(pool, jobs, size_of).run(fit_file, _died, table.write_if_rested)
-            for count, row in enumerate(done, 1):
-                table.put(row)
-                _report(row, f"{count}/{len(jobs)}", args.quiet)
-    finally:
-        table.write()
+    with chosen_pool(args.workers, args.scheduler) as pool, at_last(table.write):
+        done = Schedule(pool, jobs, size_of).run(fit_file, _died, table.write_if_rested)
+        for count, row in enumerate(done, 1):
+            table.put(row)
+            _report(row, f"{count}/{len(jobs)}", args.quiet)
 
 
 def _died(job: Job) -> Row:

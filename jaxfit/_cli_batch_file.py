@@ -106,7 +106,7 @@ def _fitted(args: argparse.Namespace) -> Row:
         "average_error_percent": 100 * done.average,
         "maximum_error_percent": 100 * done.maximum,
         "folds": fit.folds,
-        "message": fit.message,
+        "message": done.message,
         "seconds": round(done.seconds, 3),
     }
 

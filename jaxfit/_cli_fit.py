@@ -13,6 +13,7 @@ import jaxfit
 from jaxfit import io
 from jaxfit._checks import check_magnitude
 from jaxfit._cli_methods import asks_for_cloud, asks_for_grid, fit_options, interpolates
+from jaxfit._cli_report import as_sentence
 from jaxfit._scan import is_nodata
 
 TERRAIN = "jacksboro"
@@ -21,8 +22,8 @@ _LARGEST_INTERPOLATION = 40_000  # grid points, for --method auto
 
 
 class FittedFile(NamedTuple):
-    """A fit whose errors are finite, its errors as fractions of the diagonal, whether these will do, and the
-    tolerances in force.
+    """A fit whose errors are finite, its errors as fractions of the diagonal, whether these will do, the
+    tolerances in force, and why the fit stopped.
     """
 
     fit: Any
@@ -32,6 +33,7 @@ class FittedFile(NamedTuple):
     seconds: float
     reached: bool
     tolerances: str
+    message: str
 
 
 def read(args: argparse.Namespace) -> tuple[io.PointData, argparse.Namespace]:
@@ -87,16 +89,17 @@ class FitOfFile:
                 "give one by --boundary."
             )
 
-    def run(self, progress: Any = None) -> FittedFile:
+    def run(self) -> FittedFile:
         """Fit; raises ArithmeticError where the fit ends with errors that are not finite."""
         before = time.perf_counter()
-        fit = self._fit(progress)
+        fit = self._fit()
         average, maximum = float(fit.average_error), float(fit.maximum_error)
         seconds = time.perf_counter() - before
         if not (math.isfinite(average) and math.isfinite(maximum)):
             raise ArithmeticError(fit.message)
         reached = self._reached(fit, average, maximum)
-        return FittedFile(fit, self.method, average, maximum, seconds, reached, self._tolerances())
+        said = self._tolerances(), self._message(fit)
+        return FittedFile(fit, self.method, average, maximum, seconds, reached, *said)
 
     def _reached(self, fit: Any, average: float, maximum: float) -> bool:
         """Whether the errors will do. Without a requested tolerance every finite fit of a cloud does."""
@@ -104,6 +107,13 @@ class FitOfFile:
         if interpolates(self.method) and not asked:
             return bool(fit.converged)
         return all(errors[name] <= value / 100 for name, value in asked.items())
+
+    def _message(self, fit: Any) -> str:
+        """Why it stopped; where it folds, also whether the sides of the grid are the other way round."""
+        said, (n, m) = as_sentence(fit.message), self.args.grid or (0, 0)
+        if n == m or self.data.grid is None or not fit.regularity.folds:
+            return said
+        return f"{said.removesuffix('.')}, or is the grid {m}x{n}?"
 
     def _tolerances(self) -> str:
         """The tolerances in force, in per cent."""
@@ -120,9 +130,9 @@ class FitOfFile:
         given = {"tol_average": self.args.tol_average, "tol_maximum": self.args.tol_maximum}
         return {name: value for name, value in given.items() if value is not None}
 
-    def _fit(self, progress: Any) -> Any:
+    def _fit(self) -> Any:
         args, data = self.args, self.data
-        options: dict[str, Any] = {"order": args.order, "progress": progress, **self.options}
+        options: dict[str, Any] = {"order": args.order, **self.options}
         if args.max_steps is not None:
             options["max_steps"] = args.max_steps
         tolerances = {name: value / 100 for name, value in self._asked().items()}

@@ -1,21 +1,28 @@
-"""What the command line shows: a table and a progress bar, plain text where rich is missing."""
+"""What the command line shows: its table, plain text where rich is missing, and its sentences."""
 
-import contextlib
 import importlib.util
 import re
-from collections.abc import Callable, Iterator, Mapping
-
-from jaxfit._progress_line import is_switched_off
-
-Progress = Callable[[int, int, float, float], None]
+from collections.abc import Mapping
 
 # Options that sentences of the library name as in Python; not as a part of a file's name.
 _IN_PYTHON = re.compile(r"(?<![\w./\\-])(hole_length|tol_average|tol_maximum|max_steps)(?![\w-]|[./\\]\w)")
+REWORDED = {  # what else they say in Python
+    " (fit.regularity.fold_parameters)": "",
+    "StandardInterpolation()": "--method interpolate-standard",
+    "border=FreeBorder()": "--border free",
+    "a method with loss=Tukey()": "--loss tukey",
+    "by fit_points, as a cloud": "by --method approximate",
+    "work in float64 (the flag jax_enable_x64 of jax.config)": "leave out --float32",
+    "switch on double precision, the flag jax_enable_x64 of jax.config": "leave out --float32",
+    "switch on jax_enable_x64": "leave out --float32",
+}
 
 
 def as_sentence(error: object) -> str:
-    """What went wrong in one line, its options by the names they have on the command line."""
+    """What the library says in one line, its options by the names they have on the command line."""
     line = " ".join(str(error).split())
+    for python, reworded in REWORDED.items():
+        line = line.replace(python, reworded)
     return _IN_PYTHON.sub(lambda found: "--" + found[1].replace("_", "-"), line)
 
 
@@ -36,28 +43,3 @@ def print_table(rows: Mapping[str, str]) -> None:
     for name, value in rows.items():
         table.add_row(name, Text(value))  # no markup: file names may hold brackets
     Console().print(table)
-
-
-@contextlib.contextmanager
-def progress_bar(show: bool) -> Iterator[Progress | None]:
-    """A bar on stderr while the block runs; yields what a fit takes as `progress`, or None."""
-    if not show or is_switched_off() or importlib.util.find_spec("rich") is None:
-        yield None
-        return
-    from rich import progress
-    from rich.console import Console
-
-    columns = (
-        progress.TextColumn("fitting"),
-        progress.BarColumn(),
-        progress.TextColumn("{task.completed}/{task.total}  {task.fields[errors]}"),
-        progress.TimeElapsedColumn(),
-    )
-    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None, errors="")
-
-        def report(step: int, max_steps: int, average: float, maximum: float) -> None:
-            errors = f"average {100 * float(average):.4g} %, maximum {100 * float(maximum):.4g} %"
-            bar.update(task, completed=int(step), total=int(max_steps), errors=errors)
-
-        yield report

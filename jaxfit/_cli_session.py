@@ -8,7 +8,7 @@ import sys
 import jax
 
 from jaxfit._program_folder import VARIABLE, keep_programs
-from jaxfit._progress_line import BAR, SETTING, is_switched_off
+from jaxfit._progress_line import OFF, SETTING
 
 
 def choose_precision(args: argparse.Namespace) -> None:
@@ -24,9 +24,8 @@ def trace_quickly() -> None:
 
 
 def show_no_line() -> None:
-    """Have fits, those of worker processes too, show no line of their own beside the command's bar."""
-    if not is_switched_off():
-        os.environ[SETTING] = BAR
+    """Have fits say nothing of what they are doing."""
+    os.environ[SETTING] = OFF
 
 
 def set_compile_cache(args: argparse.Namespace) -> None:

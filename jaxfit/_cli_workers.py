@@ -6,9 +6,11 @@ All three take jobs as executors of `concurrent.futures` do; what differs is how
 import contextlib
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from functools import partial
 from typing import Any, TypeVar
 
 from jaxfit._batch._worker_processes import end_processes, started_processes
+from jaxfit._interrupt import at_last
 from jaxfit.io import InputError
 
 Done = TypeVar("Done")
@@ -67,7 +69,7 @@ class Cluster:
         except ImportError as error:
             raise InputError(
                 "--scheduler needs Dask's distributed, which is not installed; pip install "
-                "'jaxfit-surfaces[cluster]'."
+                '"jaxfit-surfaces[cluster]".'
             ) from error
         try:
             self._client = Client(address, timeout=_CONNECT, set_as_default=False)
@@ -98,12 +100,9 @@ class Cluster:
 def chosen_pool(workers: int, scheduler: str | None) -> Iterator[Any]:
     """The executor that the arguments ask for."""
     pool: Any = Cluster(scheduler) if scheduler else Processes(workers) if workers > 1 else Here()
-    try:
+    with at_last(partial(pool.shutdown, at_once=True)):
         yield pool
-    except BaseException:
-        pool.shutdown(at_once=True)
-        raise
-    pool.shutdown()
+        pool.shutdown()
 
 
 class Schedule:

@@ -1,19 +1,49 @@
 """Ctrl-C ends the command `jaxfit` without a traceback, also while it is still being imported."""
 
+import _thread
+import contextlib
 import os
 import signal
 import sys
 import threading
+import time
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
 EXIT_CODE = 130
 GRACE = 10.0  # seconds until an interrupted command ends, if need be without putting anything in order
 
+last_calls: list[Callable[[], Any]] = []  # of an interrupted command, the last one first
 
-def end_at_once(*_: Any) -> None:
-    """A handler of signals: there is nothing yet to be put in order."""
+
+@contextlib.contextmanager
+def at_last(call: Callable[[], Any]) -> Iterator[None]:
+    """Make this call when the block ends, also where Ctrl-C ends the command within it."""
+    last_calls.append(call)
+    with contextlib.ExitStack() as stack:
+        stack.callback(last_calls.remove, call)
+        stack.callback(call)
+        yield
+
+
+def end(*_: Any) -> None:
+    """A handler of signals that ends the process.
+
+    It raises nothing, for that can be lost: within a callback of Python's own exceptions are ignored (one of
+    those of the import system holds a lock, which nobody gives back then), and an extension that is being
+    loaded makes another of them.
+    """
+    _thread.start_new_thread(_after_grace, (os._exit,))
+    for call in reversed(last_calls):
+        with contextlib.suppress(Exception):
+            call()
     os._exit(EXIT_CODE)
+
+
+def _after_grace(leave: Callable[[int], Any]) -> None:
+    time.sleep(GRACE)
+    leave(EXIT_CODE)
 
 
 def is_command() -> bool:
@@ -23,27 +53,9 @@ def is_command() -> bool:
     return as_module or os.path.splitext(name)[0] in ("jaxfit", "jaxfit-script")
 
 
-def interrupt(*_: Any) -> None:
-    """Raise KeyboardInterrupt, and see to it that the process ends.
-
-    What is raised within a callback of Python's own is ignored there; one of those of the import system holds
-    a lock, which nobody gives back then.
-    """
-    last = threading.Timer(GRACE, os._exit, [EXIT_CODE])
-    last.daemon = True
-    last.start()
-    raise KeyboardInterrupt
-
-
-def restore_ctrl_c() -> None:
-    """Have Ctrl-C raise KeyboardInterrupt, once there is someone to catch it."""
-    if signal.getsignal(signal.SIGINT) is end_at_once:
-        signal.signal(signal.SIGINT, interrupt)
-
-
 if (
     is_command()
     and threading.current_thread() is threading.main_thread()
     and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ):
-    signal.signal(signal.SIGINT, end_at_once)
+    signal.signal(signal.SIGINT, end)

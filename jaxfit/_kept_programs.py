@@ -23,6 +23,8 @@ import jax
 import numpy as np
 from jax.experimental import serialize_executable
 
+from jaxfit._interrupt import at_last
+
 SUFFIX = "-cache"
 TRACED_WITH = ("jax", "jaxlib", "numpy", "equinox", "lineax", "optimistix", "jaxopt")
 _WORDS = (str, bytes, bool, int, float, complex, type(None), type(Ellipsis))
@@ -113,11 +115,9 @@ def _compiled(path: Path, lowered: Any) -> Any:
         # The tree of the results, as results: of those pickle knows the classes.
         results = jax.tree.unflatten(tree, range(tree.num_leaves))
         unfinished = path.with_name(f"{path.name}.{os.getpid()}{SUFFIX}")
-        try:
+        with at_last(functools.partial(unfinished.unlink, missing_ok=True)):
             unfinished.write_bytes(zlib.compress(pickle.dumps((found, results)), 1))
             os.replace(unfinished, path)
-        finally:
-            unfinished.unlink(missing_ok=True)
     return program
 
 

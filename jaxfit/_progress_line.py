@@ -15,9 +15,10 @@ from functools import wraps
 from typing import Any
 
 from jaxfit._checks import is_concrete
+from jaxfit._interrupt import at_last
 
 SETTING = "JAXFIT_PROGRESS"  # "off" in the environment shows nothing
-OFF, BAR = "off", "bar"  # the latter where the command shows a bar of its own
+OFF = "off"
 DELAY = 3.0  # seconds before the line appears
 INTERVAL = 0.25  # between two updates
 COMPILER = "backend_compile"  # begins or is within the name of JAX's function that waits for XLA
@@ -79,24 +80,23 @@ def _line_of(phase: str) -> Iterator[None]:
         return
     line = _Line(phase)
     thread = threading.Thread(target=line.watch, daemon=True)
-    try:
-        _lines.append(line)
-        thread.start()
-        yield
-    finally:
+
+    def end() -> None:
         _lines.clear()
         line.ended.set()
         thread.join()  # the line is gone before anything else is printed
+
+    try:
+        with at_last(end):
+            _lines.append(line)
+            thread.start()
+            yield
+    finally:
         _one_line.release()
 
 
-def is_switched_off() -> bool:
-    """Whether the environment asks for no progress."""
-    return os.environ.get(SETTING, "").lower() == OFF
-
-
 def _is_watched() -> bool:
-    if is_switched_off() or os.environ.get(SETTING) == BAR or multiprocessing.parent_process():
+    if os.environ.get(SETTING, "").lower() == OFF or multiprocessing.parent_process():
         return False
     return _in_notebook() or bool(getattr(sys.stderr, "isatty", bool)())
 

@@ -1,5 +1,6 @@
 """What would mislead a fit is refused in a sentence, before anything is computed or allocated."""
 
+import dataclasses
 import inspect
 import io
 import os
@@ -8,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 
@@ -17,7 +19,7 @@ import pytest
 from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit as jf
-from jaxfit import _cli
+from jaxfit import _cli, _interrupt
 from jaxfit._approximation._sharded_fit import fit_sharded_cloud
 from jaxfit._approximation._smoothing_term import check_smoothing
 from jaxfit._checks import as_floating, check_number
@@ -453,6 +455,17 @@ def test_a_printed_fit_tells_its_errors(fit):
     assert "8 x 7 control points, average error" in repr(fit)
 
 
+@pytest.mark.parametrize(
+    ("left_out", "more"),
+    [({}, False), ({"nodata": 1, "non_finite": 1}, False), ({"nodata": 2, "outliers": 1}, True)],
+)
+def test_errors_of_points_left_out_are_printed_where_there_are_any(fit, left_out, more):
+    errors = fit.errors.at[0, :2].set(np.nan if left_out else 0.0)
+    scan = dataclasses.replace(fit, errors=errors, stats=fit.stats | {"points_read": 56} | left_out)
+    assert (" of the diagonal, of the points that count" in str(scan)) == bool(left_out)
+    assert ("all points" in str(scan)) == more
+
+
 def test_a_fit_without_values_prints_its_shapes(fit):
     shapes = []
     jax.eval_shape(lambda grid: shapes.append(str(jf.interpolate(grid))), GRID)
@@ -500,25 +513,49 @@ def test_bad_usage_is_noticed_before_the_fit(folder, monkeypatch, capsys, argv, 
 
 
 LOST = """
-import os, signal, time
-from jaxfit import _interrupt
-_interrupt.GRACE = 0.1
-signal.signal(signal.SIGINT, _interrupt.end_at_once)
-_interrupt.restore_ctrl_c()
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(1.0)
-except KeyboardInterrupt:
-    time.sleep(60.0)
+import os, signal, sys, weakref
+sys.argv = ["jaxfit", *"fit grid.npz -o s.npz --no-cache --no-picture".split()]
+import jaxfit
+from jaxfit import _cli
+
+class Loading: pass
+
+def fit(*_, **__):
+    loading = Loading()
+    watch = weakref.ref(loading, lambda _: os.kill(os.getpid(), signal.SIGINT))
+    del loading
+    raise ImportError("initialization failed")
+
+jaxfit.interpolate = fit
+_cli.main()
 """
 
 
 @pytest.mark.skipif(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, reason="no SIGINT here")
-def test_an_interrupt_that_is_lost_ends_the_command():
-    """As Python loses those that come while it runs a callback of a weak reference."""
+def test_an_interrupt_where_exceptions_are_lost_ends_the_command(tmp_path):
+    """As Python loses those within a callback of a weak reference, and extensions while they are loaded."""
+    np.savez(tmp_path / "grid.npz", grid=GRID)
     environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
-    done = subprocess.run([sys.executable, "-c", LOST], env=environment, timeout=50)
-    assert done.returncode == 130
+    command = [sys.executable, "-c", LOST]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=50)
+    said = "jaxfit: error: interrupted, nothing more is written.\n"
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", said)
+
+
+def test_an_interrupt_takes_away_what_is_written_in_part(folder, monkeypatch):
+    left = []
+    monkeypatch.setattr(os, "_exit", lambda code: left.append((code, os.listdir())))
+    monkeypatch.setattr(os, "replace", lambda part, path: (os.stat(part), _interrupt.end()))
+    write_surface("s.npz", wavy_surface())
+    assert left == [(130, ["grid.npz"])]
+
+
+def test_an_interrupted_command_waits_for_nothing_that_hangs(monkeypatch):
+    monkeypatch.setattr(_interrupt, "GRACE", 0.0)
+    ended = threading.Event()
+    monkeypatch.setattr(os, "_exit", lambda code: ended.set())
+    with _interrupt.at_last(lambda: ended.wait(50) or pytest.fail("it hangs")):
+        _interrupt.end()
 
 
 @pytest.mark.skipif(signal.getsignal(signal.SIGINT) == signal.SIG_IGN, reason="no SIGINT here")

@@ -87,8 +87,8 @@ def test_folds_are_those_inside_the_loops(folder, monkeypatch):
     np.savez("grid.npz", grid=grid)
     real = FitOfFile.run
 
-    def with_loops(self, progress=None):
-        done = real(self, progress)
+    def with_loops(self):
+        done = real(self)
         assert done.fit.folds > 0
         corners = np.array([[0, 0], [0.3, 0], [0.3, 1], [0, 1]])
         trimmed = jf.TrimmedSurface(done.fit.surface, (corners,))
@@ -139,7 +139,7 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
         (["a.npz", "-o", "a.npz"], "cannot be made"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
-        (["a.npz", "--scheduler", "tcp://x"], "pip install 'jaxfit-surfaces[cluster]'"),
+        (["a.npz", "--scheduler", "tcp://x"], 'pip install "jaxfit-surfaces[cluster]"'),
         ([], "FILE"),
     ],
 )

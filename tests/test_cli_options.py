@@ -1,10 +1,11 @@
 """What the command line hands to the fit, shows, and returns; the fit itself is faked here."""
 
+import ast
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers import wavy_cloud, wavy_grid, wavy_surface
+from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit
 from jaxfit import _cli, _cli_report, plot
@@ -17,26 +18,25 @@ def fits(monkeypatch):
     calls = SimpleNamespace(
         made=[], average=1e-5, maximum=1e-4, converged=True, fails=None, trimmed=None, stats={}
     )
+    calls.surface, calls.message = wavy_surface(), "The errors are within their tolerances."
 
     def fake(name):
         def fit(data, *args, **options):
             calls.made.append((name, data, args, options))
             if calls.fails:
                 raise calls.fails
-            if options["progress"]:
-                options["progress"](3, 10, calls.average, calls.maximum)
             count = np.asarray(data).reshape(-1, 3).shape[0]
             u, v = np.random.default_rng(0).uniform(size=(2, count))
             return SimpleNamespace(
-                surface=wavy_surface(),
-                regularity=jaxfit.regularity(wavy_surface()),
+                surface=calls.surface,
+                regularity=jaxfit.regularity(calls.surface),
                 u=u,
                 v=v,
                 errors=np.full(count, calls.average),
                 average_error=calls.average,
                 maximum_error=calls.maximum,
                 converged=calls.converged,
-                message="The errors are within their tolerances.",
+                message=calls.message,
                 stats={"num_steps": 3, "diagonal": 1.0, **calls.stats},
                 trimmed=calls.trimmed,
                 inside=np.full(count, True),
@@ -135,13 +135,11 @@ def test_options_arrive_as_fractions(fits, folder):
         "tol_average": pytest.approx(2e-4),
         "tol_maximum": pytest.approx(5e-3),
         "max_steps": 7,
-        "progress": None,
     }
     assert run("grid.npz", "--tol-average", "0.1", "--tol-maximum", "0.01") in (0, 1)
     assert fits.made[1][3] == {
         "order": (4, 4),
         "tolerance": pytest.approx(1e-4),
-        "progress": None,
     }
     assert run("cloud.npz", "--order", "3") == 0
     assert fits.made[2][3]["order"] == (3, 3)
@@ -151,7 +149,7 @@ def test_points_without_boundary_are_fitted_without(fits, folder):
     assert run("bare.xyz", "--hole-length", "0.25") == 0
     _, points, arguments, options = fits.made[0]
     assert (points.shape, arguments) == ((60, 3), (None,))
-    assert set(options) == {"order", "progress", "net", "faces", "hole_length"}
+    assert set(options) == {"order", "net", "faces", "hole_length"}
     assert (options["faces"], options["hole_length"]) == (None, 0.25)
 
 
@@ -304,7 +302,7 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["batch", "cloud.npz", "-o", "new", "--no-picture"], "--no-picture; see jaxfit batch --help"),
         (["fit", "none.npz", "-o", "s.npz"], "none.npz does not exist"),
         (["fit", "bare.xyz", "-o", "s.npz", "--method", "interpolate"], "cannot be interpolated"),
-        (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "7 x 7 grid of 49"),
+        (["fit", "bare.xyz", "-o", "s.npz", "--grid", "7x7"], "bare.xyz holds 60 points, which do not"),
         (["fit", "bare.xyz", "-o", "s.npz", "--boundary", "grid.npz"], "holds no boundary"),
         (["fit", "grid.npz", "-o", "s.npz", "--method", "interpolate", "--net", "5x5"], "--net"),
         (["fit", "cloud.npz", "-o", "s.dwg"], "suffix .dwg"),
@@ -397,6 +395,34 @@ def test_the_table_says_the_tolerances_in_force(fits, folder, capsys, argv, said
     assert row.removeprefix("tolerances").strip() == said
 
 
+@pytest.mark.parametrize(
+    ("argv", "folds", "asked"),
+    [
+        ("bare.xyz --grid 6x10", True, ", or is the grid 10x6?"),
+        ("bare.xyz --grid 6x10", False, "."),
+        ("grid.npz", True, "."),
+    ],
+)
+def test_where_a_grid_folds_its_sides_are_asked_for(fits, folder, capsys, argv, folds, asked):
+    if folds:
+        net = fits.surface.control_points
+        fits.surface = jaxfit.BSplineSurface(
+            net[:, ::-1].at[:3].set(net[:3]), fits.surface.knots_u, fits.surface.knots_v
+        )
+    fits.message = "it folds: look whether its points are in order (fit.regularity.fold_parameters)."
+    assert run(*argv.split(), "--tol-average", "1") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"it folds: look whether its points are in order{asked} tolerances" in said
+
+
+def test_what_is_reworded_for_the_command_line_is_said_somewhere():
+    sources = [path.read_text() for path in (CHECKOUT / "jaxfit").rglob("*.py") if path.stem != "_cli_report"]
+    nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
+    texts = [str(node.value) for node in nodes if isinstance(node, ast.Constant)]
+    for python in _cli_report.REWORDED:
+        assert any(python in text for text in texts), python
+
+
 def test_sentences_name_options_as_on_the_command_line(fits, folder, capsys):
     fits.fails = ValueError("raise hole_length, or\n tol_average; see hole_length.csv and ./max_steps.")
     assert run("bare.xyz") == 2
@@ -408,16 +434,6 @@ def test_quiet_is_silent(fits, folder, capsys):
     assert run("cloud.npz", "--quiet") == 0
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
-
-
-def test_progress_goes_to_a_terminal_only(fits, folder, capsys, monkeypatch):
-    run("cloud.npz")
-    assert fits.made[-1][3]["progress"] is None
-    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
-    run("cloud.npz")
-    assert fits.made[-1][3]["progress"] is not None
-    run("cloud.npz", "--quiet")
-    assert fits.made[-1][3]["progress"] is None
 
 
 def test_the_picture_lies_beside_the_surface(fits, folder):
@@ -435,6 +451,23 @@ def test_without_matplotlib_there_is_no_picture(fits, folder, capsys, monkeypatc
     argv = ["fit", "cloud.npz", "-o", "s.json", "--picture", "p.png"]
     assert _cli.main(argv) == 2
     assert "jaxfit-surfaces[plot]" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["fit", "batch"])
+def test_the_help_has_all_exit_codes(capsys, command):
+    with pytest.raises(SystemExit):
+        _cli.main([command, "--help"])
+    codes = capsys.readouterr().out.split("exit codes:\n")[1].split("\n\n")[0]
+    assert [line.split()[0] for line in codes.splitlines()] == ["0", "1", "2", "3", "130"]
+
+
+def test_the_help_trims_no_3dm(capsys):
+    with pytest.raises(SystemExit):
+        _cli.main(["fit", "--help"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if ".3dm" in line]
+    assert len(lines) == 1
+    assert "the whole surface" in lines[0]
+    assert "trimmed" not in lines[0]
 
 
 @pytest.mark.parametrize("argv", [["--help"], ["fit", "--help"], ["--version"]])

@@ -205,6 +205,17 @@ def test_a_foot_is_never_farther_than_its_start(wavy, method, seed):
     assert ((u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)).all()
 
 
+def test_a_foot_does_not_stop_where_a_second_step_takes_back_the_first():
+    knots = helpers.clamped_uniform(42, 4)
+    surface = BSplineSurface(helpers.wavy_net(42, 42), knots, knots)
+    point = np.array([[0.9857623191308966, 0.0985346778076581, -0.07209940025004573]])
+    start = np.array([0.964044578673147]), np.array([0.06376128790671072])
+    found = closest_point(surface, point, start)
+    assert bool(found.converged[0])
+    assert int(found.steps[0]) < 9
+    np.testing.assert_allclose(found.distance, closest_point(surface, point).distance, rtol=1e-12)
+
+
 def test_too_few_steps_are_reported(wavy):
     points, _, _ = queries(wavy)
     feet = closest_point(wavy, points, start=(np.zeros(COUNT), np.zeros(COUNT)), max_steps=1)

@@ -108,6 +108,12 @@ def test_no_room_changes_the_global_configuration():
     assert not changed
 
 
+def test_what_to_install_is_quoted_alike():
+    """In double quotes, which all shells know."""
+    install = re.compile(r"""(?<!")jaxfit-surfaces\[|jaxfit-surfaces\[[^]]+\](?!")""")
+    assert [path.name for path in MODULES if install.search(path.read_text())] == []
+
+
 def test_cores_are_counted_in_one_place():
     counts = re.compile(r"cpu_count|getaffinity|workers=-1")
     assert [path.name for path in MODULES if counts.search(path.read_text())] == ["_cores.py"]

@@ -42,7 +42,7 @@ def test_npz_with_points_and_boundary(tmp_path):
     points, edges = wavy_cloud(50)
     path = npz(tmp_path / "cloud.npz", points=points, extra=np.ones(3), **boundary_arrays(edges))
     read = read_points(path)
-    assert read.name == "cloud"
+    assert read.name == "cloud.npz"
     assert read.grid is None
     np.testing.assert_array_equal(read.points, points)
     np.testing.assert_array_equal(read.cloud, points)

@@ -111,8 +111,13 @@ def test_outputs_are_refused_before_any_work(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="does not exist"):
         check_output(tmp_path / "none" / "s.npz")
     (tmp_path / "d.npz").mkdir()
-    with pytest.raises(InputError, match="is a folder"):
-        check_output(tmp_path / "d.npz")
+    for folder, options, file in (
+        (tmp_path / "d.npz", (), "surface.step"),
+        (tmp_path, (), "surface.step"),
+        (tmp_path, ((".png", ".pdf"),), "surface.png"),
+    ):
+        with pytest.raises(InputError, match=f"{folder} is a folder; .* such as {folder}/{file}"):
+            check_output(folder, *options)
 
     def refuse(*args, **kwargs):
         raise PermissionError(13, "Permission denied")

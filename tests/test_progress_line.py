@@ -13,10 +13,9 @@ import rich.live  # noqa: F401 - importing it takes longer than a short fit
 from helpers import wavy_cloud
 
 import jaxfit as jf
-from jaxfit import _progress_line
+from jaxfit import _cli, _progress_line
 from jaxfit._approximation import _cloud_fit
 from jaxfit._approximation._room import Room
-from jaxfit._cli_report import progress_bar
 
 
 class Terminal(io.StringIO):
@@ -68,6 +67,16 @@ def test_fits_say_what_they_do(shown):
     assert "jaxfit: interpolating a grid" in shown(jf.interpolate, GRID)
 
 
+def test_the_command_says_the_same(shown, monkeypatch, tmp_path):
+    monkeypatch.setenv(_progress_line.SETTING, "")  # which the command may set
+    sides = {f"boundary_{side}": polyline for side, polyline in SIDES.items()}
+    np.savez(tmp_path / "cloud.npz", points=CLOUD, **sides)
+    argv = f"fit {tmp_path}/cloud.npz -o {tmp_path}/s.npz --no-picture --no-cache".split()
+    argv += "--net 6x6 --max-steps 2".split()
+    assert "jaxfit: fitting 6 x 6 control points to 300 points" in shown(_cli.main, argv)
+    assert shown(_cli.main, [*argv, "--quiet"]) == ""
+
+
 def test_a_net_chosen_by_some_of_the_points_says_of_how_many(monkeypatch):
     said = []
     monkeypatch.setattr(_cloud_fit, "doing", said.append)
@@ -104,8 +113,6 @@ def test_nothing_is_started_where_nothing_is_to_be_shown(shown, monkeypatch):
     assert shown(traced) == ""
     monkeypatch.setenv(_progress_line.SETTING, "off")
     assert shown(wait) == ""
-    with progress_bar(show=True) as report:  # of the command
-        assert report is None
 
 
 def test_short_work_shows_nothing(shown, monkeypatch):

@@ -105,7 +105,7 @@ def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys):
     argv = "fit cloud.npz -o s.npz --net 6x6 --max-steps 3 --tol-average 5 --loss huber --no-picture".split()
     assert _cli.main([*argv, *"--method geometric --report r.html".split()]) == 0
     page = Page((tmp_path / "r.html").read_text())
-    assert page.headings[:4] == ["cloud", "Input", "Settings", "Output"]
+    assert page.headings[:4] == ["cloud.npz", "Input", "Settings", "Output"]
     pairs = dict(zip(page.cells[::2], page.cells[1::2], strict=True))
     assert pairs["--loss"] == "huber"
     given = {name for name in pairs if name.startswith("--")}

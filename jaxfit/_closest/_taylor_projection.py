@@ -78,17 +78,21 @@ def certified_step(
     It is certain if the bound proves the true residual's tangential part to be within the tolerance.
     """
 
-    def solve(at: Expansion, forms: Forms, active: Array) -> tuple[Array, Array]:
+    def solve(at: Expansion, forms: Forms, active: Array) -> tuple[Array, Array, Array]:
         # A second step with the same matrix, on the polynomial: order three from one evaluation.
         inverse = _inverse(forms, active)
         step = inverse(forms.gradient)
         e, tangents = _taylor(at, step)
-        return step + inverse(inner(e, tangents)), inverse.free
+        second = inverse(inner(e, tangents))
+        # Where the second takes back the first, both together lead nowhere although there is no foot.
+        return step + second, total((0.5 * step + second) * forms.gradient), inverse.free
 
-    step, free = materialise(always, solve, at, forms, active)
+    step, progress, free = materialise(always, solve, at, forms, active)
     e, tangents = materialise(always, _taylor, at, step)
 
-    def certify(e: Array, tangents: Array, step: Array, free: Array, forms: Forms, x: Array) -> tuple:
+    def certify(
+        e: Array, tangents: Array, step: Array, progress: Array, free: Array, forms: Forms, x: Array
+    ) -> tuple:
         f, length = inner(e, e), total(jnp.abs(step))
         end = x + step * bounds.half
         # A coupled step that is cut off at a bound may lead away from the foot.
@@ -107,11 +111,10 @@ def certified_step(
         eps = ROUNDING * float(jnp.finfo(f.dtype).eps)
         nearer = f <= forms.f * (1.0 + eps) + tolerance**2
         certain = both(within & proven) & nearer
-        downhill = total(step * forms.gradient) > 0
-        good = nearer & downhill & both(allowed) & (length < LONGEST_TAYLOR_STEP)
+        good = nearer & (progress > 0) & both(allowed) & (length < LONGEST_TAYLOR_STEP)
         return Prediction(nearest, e, f, certain), good
 
-    return materialise(always, certify, e, tangents, step, free, forms, x)
+    return materialise(always, certify, e, tangents, step, progress, free, forms, x)
 
 
 def _inverse(forms: Forms, active: Array) -> _Inverse:

@@ -37,7 +37,7 @@ def facts(fit: Any) -> dict[str, str]:
     """Names and values for a table: net, order, iterations, errors in per cent, how regular the surface is,
     and why the fit stopped.
     """
-    some = ", without points left out" if left_out(fit) else ""
+    some = ", of the points that count" if left_out(fit) else ""
     return {
         "net": _said_net(fit),
         "order": "{} x {}".format(*fit.surface.order),
@@ -123,8 +123,9 @@ def _cleaning_facts(fit: Any) -> dict[str, str]:
         return {}
     counts = left_out(fit)
     reasons = ", ".join(f"{count:,} {name}" for name, count in counts.items())
-    said = {"points read": f"{int(fit.stats['points_read']):,}; left out: {reasons or 'none'}"}
-    if counts:
+    read = int(fit.stats["points_read"])
+    said = {"points read": f"{read:,}; left out: {reasons or 'none'}"}
+    if np.isfinite(np.asarray(fit.errors)).sum() > read - sum(counts.values()):
         average, maximum = errors_of_all(fit)
         said["all points"] = f"average error {average:.4g} %, maximum {maximum:.4g} %, with those left out"
     return said

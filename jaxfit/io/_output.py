@@ -1,8 +1,10 @@
 """Files appear whole or not at all."""
 
 import os
+from functools import partial
 from pathlib import Path
 
+from jaxfit._interrupt import at_last
 from jaxfit.io._extras import import_extra
 from jaxfit.io._point_data import InputError
 
@@ -40,25 +42,25 @@ def check_output(path: str | os.PathLike, suffixes: tuple[str, ...] = _SURFACES)
     surface.xyz has the suffix .xyz, so its format is not known; use one of .npz, .json.
     """
     path = Path(path)
+    if path.is_dir():
+        file = path / f"surface{'.step' if '.step' in suffixes else suffixes[0]}"
+        raise InputError(f"{path} is a folder; name a file in it, such as {file}.")
     if path.suffix.lower() not in suffixes:
         raise InputError(
             f"{path} has {'no suffix' if not path.suffix else f'the suffix {path.suffix}'}, so "
             f"its format is not known; use one of {', '.join(suffixes)}."
         )
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file in it.")
     part = _part(path)
     if not part.parent.is_dir():
         raise InputError(f"the folder {part.parent} does not exist; make it first.")
     try:
         # Permission bits say too little (an administrator ignores them), so try.
-        part.touch()
+        with at_last(partial(part.unlink, missing_ok=True)):
+            part.touch()
     except OSError as error:
         raise InputError(
             f"no file can be written in the folder {part.parent}: {error.strerror or error}."
         ) from error
-    finally:
-        part.unlink(missing_ok=True)
     if (suffix := path.suffix.lower()) in LIBRARIES:
         import_extra(LIBRARIES[suffix], suffix, "cad")
 
@@ -73,13 +75,12 @@ def write_atomically(path: str | os.PathLike, content: bytes) -> None:
     """
     part = _part(Path(path))
     try:
-        part.write_bytes(content)
-        os.replace(part, os.path.realpath(path))
+        with at_last(partial(part.unlink, missing_ok=True)):
+            part.write_bytes(content)
+            os.replace(part, os.path.realpath(path))
     except OSError as error:
         reason = error.strerror or error
         raise OSError(f"{path} cannot be written ({reason}); make room, or name another file.") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _part(path: Path) -> Path:

@@ -40,7 +40,7 @@ class PointData:
         (None where the edges make no boundary, for instance because one of them is a single
         point). None when nothing is known about the border.
     name : str
-        Short name for tables and titles: the file's name without folder and suffix.
+        Short name for tables, titles and sentences: the file's name without its folder.
     left_out : dict of int
         Of a scanner's file or a mesh: how many of its points are not in `points`, by reason; empty if
         all are. The reasons are "withheld" and "classified as noise" (LAS), "invalid" (E57),

@@ -159,8 +159,8 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
             f"at least {_LEAST_POINTS}; give more."
         )
     if key == "grid":
-        return grid_data(array, path.stem, path)
-    return PointData(array, None, None, path.stem)
+        return grid_data(array, path.name, path)
+    return PointData(array, None, None, path.name)
 
 
 def _coordinates(

@@ -37,7 +37,7 @@ def jacksboro() -> PointData:
     except ImportError as error:
         raise InputError(
             "the jacksboro terrain comes with Matplotlib, which is not installed; "
-            "pip install 'jaxfit-surfaces[plot]'."
+            'pip install "jaxfit-surfaces[plot]".'
         ) from error
     opened: Any = get_sample_data("jacksboro_fault_dem.npz")
     with opened as sample:

@@ -1,4 +1,4 @@
-"""Pictures of fits; needs Matplotlib (``pip install 'jaxfit-surfaces[plot]'``)."""
+"""Pictures of fits; needs Matplotlib (``pip install "jaxfit-surfaces[plot]"``)."""
 
 from jaxfit.plot._history import history
 from jaxfit.plot._loops import loops

@@ -241,7 +241,7 @@ def blank_figure(width: int, rows: int = 1) -> "Figure":
         from matplotlib.figure import Figure
     except ImportError as error:
         raise ImportError(
-            "pictures need Matplotlib, which is not installed; pip install 'jaxfit-surfaces[plot]'."
+            'pictures need Matplotlib, which is not installed; pip install "jaxfit-surfaces[plot]".'
         ) from error
     figure = Figure(figsize=(width, 5.2 * rows), layout="constrained")
     FigureCanvasAgg(figure)
