@@ -18,6 +18,10 @@ LARGEST = 1e150
 LARGEST_COUNT = 2**31 - 2
 # Between which the coordinates of a cloud can choose, along its diagonal.
 LEAST_STEPS = {np.dtype(np.float64): 1e4, np.dtype(np.float32): 1e3}
+_INSTEAD = {  # of None
+    "points": "where data.points of a file is None, pass data itself, or data.grid.reshape(-1, 3)",
+    "grid": "where data.grid of a file is None, pass data.as_grid(n, m), or fit data by fit_points",
+}
 
 
 def is_concrete(*trees: Any) -> bool:
@@ -65,6 +69,8 @@ def said_missing(path: str | os.PathLike) -> str:
 def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
     """`x` as a floating array with `ndim` dimensions; NumPy stays NumPy, so that nothing compiles."""
     array: Any = x
+    if x is None:
+        raise TypeError(f"{name} must be an array, but is None; {_INSTEAD.get(name, 'pass one')}.")
     if isinstance(x, str | os.PathLike):
         raise TypeError(
             f"{name} must be an array, but is {os.fspath(x)!r}; read a file by jaxfit.io.read_points."

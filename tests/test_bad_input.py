@@ -80,10 +80,13 @@ def test_named_columns_of_whole_numbers_are_no_decimal_commas(tmp_path):
 def test_a_column_that_counts_the_points_is_refused(tmp_path, first, name):
     delimiter = "," if name == "a.csv" else " "
     numbered = np.column_stack([np.arange(first, first + 60), POINTS])
-    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="n,a,b,c", comments="")
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header="my scan", comments="")
     with pytest.raises(InputError, match=f"{name}: the first column only counts the points") as error:
         read_points(tmp_path / name)
-    assert "remove it" in sentence(error)
+    assert "remove it, or name the columns x, y and z in the first line" in sentence(error)
+    header = delimiter.join("xyzw")
+    np.savetxt(tmp_path / name, numbered, delimiter=delimiter, header=header, comments="")
+    np.testing.assert_array_equal(read_points(tmp_path / name).points, numbered[:, :3])
     np.savetxt(tmp_path / name, numbered[:, [1, 2, 3, 0]], delimiter=delimiter)
     np.testing.assert_array_equal(read_points(tmp_path / name).points, POINTS)
 
@@ -339,6 +342,14 @@ def test_what_is_mixed_up_gets_the_advice_that_helps(call, advice, monkeypatch):
         (
             lambda: inspect.unwrap(as_floating)("points", PointData(POINTS, None, None, "a"), 2),
             "points must be an array, but is a PointData; pass its .cloud or .grid",
+        ),
+        (
+            lambda: inspect.unwrap(as_floating)("points", None, 2),
+            r"points must be an array, but is None; .* pass data itself, or data\.grid\.reshape\(-1, 3\)\.",
+        ),
+        (
+            lambda: inspect.unwrap(as_floating)("grid", None, 3),
+            r"grid must be an array, but is None; .* pass data\.as_grid\(n, m\), or fit data by fit_points\.",
         ),
         *(
             (

@@ -112,12 +112,48 @@ def lines(delimiter, extra=""):
         ("a.txt", "# made by hand\n\n" + lines("\t", "  # yes")),
         ("a.csv", lines(",")),
         ("a.csv", "x,y,z\n" + lines(", ")),
-        ("a.CSV", "\ufeffeast, north, height, red\n" + lines(",", ",255")),
+        ("a.CSV", "\ufeffeast, north, height\n" + lines(",")),
+        ("a.csv", "X,Y,Z,x_m,y_m,z_m\n" + lines(",", ",7,8,9")),
+        ("a.csv", "x\ty\tz\n" + lines("\t")),
         ("a.xyz", "x y z\n" + lines("   ", " 0.5 0.5")),
     ],
 )
 def test_text_is_read_exactly(tmp_path, name, content):
     np.testing.assert_array_equal(read_points(text(tmp_path / name, content)).points, POINTS)
+
+
+@pytest.mark.parametrize(
+    ("name", "header"),
+    [
+        ("a.csv", "nr, X (mm), Y (mm), Z (mm)"),
+        ("a.csv", "nr;x_mm;y_mm;z_mm"),
+        ("a.csv", '"nr","X [m]","Y [m]","Z [m]"'),
+        ("a.csv", "nr\tx/mm\ty/mm\tz/mm"),
+        ("a.txt", "nr X (mm) Y (mm) Z (mm)"),
+        ("a.txt", "Point ID\tX\tY\tZ"),
+        ("a.txt", "nr, x mm, y mm, z mm"),
+    ],
+)
+def test_names_may_have_units(tmp_path, name, header):
+    between = next((x for x in ";\t," if x in header and name == "a.csv"), " ")
+    rows = "\n".join(between.join(map(repr, [7.0, *row])) for row in POINTS.tolist())
+    np.testing.assert_array_equal(read_points(text(tmp_path / name, f"{header}\n{rows}\n")).points, POINTS)
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "said"),
+    [
+        ("a.csv", "Nr;Rechtswert;Hochwert;Hoehe", "its columns Nr, Rechtswert, Hochwert, Hoehe; name three"),
+        ("a.csv", ",lon,lat,height", "its columns '', lon, lat, height; name three of them x, y and z"),
+        ("a.csv", "x (m),y (m),x (px),y (px)", "its columns x (m), y (m), x (px), y (px); name"),
+        ("a.csv", "nr,x_normal,y_normal,z_normal", "nr, x_normal, y_normal, z_normal; name"),
+        ("a.xyz", "Point ID x y z", "its columns Point, ID, x, y, z, but has 4; name three"),
+    ],
+)
+def test_names_that_do_not_tell_the_axes_are_refused(tmp_path, name, header, said):
+    between = next((x for x in ";," if x in header), " ")
+    rows = "".join(between.join(map(repr, [7.0, *row])) + "\n" for row in POINTS.tolist())
+    assert said in sentence(text(tmp_path / name, f"{header}\n{rows}"))
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.txt"])
@@ -191,6 +227,7 @@ def test_python_objects_are_never_loaded(tmp_path):
         ({"grid": POINTS[None]}, "grid of 1 x 8 points"),
         ({"points": POINTS + 1j}, "real numbers"),
         ({"points": POINTS.astype(str)}, "real numbers"),
+        ({"points": np.ones((30, 20))}, "(30, 20); it must be (N, 3), or a grid (n, m, 3) if these are"),
         ({"points": POINTS[:3]}, "3 points, but a surface needs at least 4"),
         ({"points": POINTS[:1]}, "1 point, but"),
         ({"points": POINTS[:0]}, "0 points, but"),
@@ -230,6 +267,11 @@ def test_a_bad_boundary_is_refused(tmp_path):
         ("a.xyz", "0 0 0\n1 nan 1\n0 1 inf\n1 1 1\n", "2 of 4 points have NaN"),
         ("a.xyz", "# c\n0 0 0\n1 nan 1\n0 1 0\n1 1 1\n", "the first in line 3"),
         ("a.xyz", "0 0 0\n1 0 1\n0 1 0\n", "3 points, but a surface needs at least 4"),
+        ("a.csv", ",".join(["0.5"] * 20) + "\n", "has 20 columns without names; give one point x,y,z a line"),
+        ("a.csv", "x,y,z\n[m],[m],[m]\n0,0,0\n", "line 2 is no point, and only one line of names may come"),
+        ("a.csv", "Scan 7\n\nx,y,z\n0,0,0\n", "line 1 is no point, and only one line of names may come"),
+        ("a.csv", "x,y,z\n0,one,0\n1,1,1\n", "line 2 has 'one' in place of a number"),
+        ("a.csv", "0,0,0\none,two,three\n", "line 2 has 'one' in place of a number"),
         ("a.xyz", "# nothing\n\n", "holds no points"),
         ("a.csv", "x,y,z\n", "holds no points"),
     ],

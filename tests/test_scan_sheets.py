@@ -124,6 +124,16 @@ def test_a_hole_wider_than_the_length_is_a_hole():
     assert len(sheet_of(points, hole_length=0.7).loops) == 1
 
 
+@pytest.mark.parametrize("points", [100 * square(), sphere()[:350]], ids=["level", "bent"])
+def test_a_hole_length_below_the_distance_of_neighbours_is_said(points):
+    faces = sheet_of(points).faces
+    for given in (None, faces):
+        with pytest.raises(
+            ValueError, match=r"^hole_length is 0\.05, but neighbours are some .* apart; raise it\.$"
+        ):
+            sheet_of(points, given, hole_length=0.05)
+
+
 def test_a_sheet_that_overhangs_is_laid_out_without_flips():
     around, along = np.meshgrid(np.linspace(0, 1.6 * np.pi, 50), np.linspace(0, 1, 12), indexing="ij")
     roll = np.stack([0.5 * np.cos(around), 0.5 * np.sin(around), along], axis=2).reshape(-1, 3)

@@ -12,7 +12,7 @@ from jaxfit._scan._flat_places import Rectangle, rectangle_around
 from jaxfit._scan._knot_density import break_points, knot_densities
 from jaxfit._scan._level_sheet import principal_frame
 from jaxfit._scan._manifold import Faces, manifold
-from jaxfit._scan._sheet_mesh import COVERED, sheet_mesh
+from jaxfit._scan._sheet_mesh import COVERED, neighbour_distance, sheet_mesh
 
 LEAST_POINTS = 12
 LINE = 1e-6  # of the spread along it: points that spread less across it lie on a line
@@ -83,7 +83,15 @@ def sheet_of(
     _check_no_line(cloud)
     asked = None if hole_length is None else hole_length / size
     doing("connecting neighbours to a mesh")
-    mesh, length = sheet_mesh(cloud, _given_faces(points, clean, faces), asked)
+    given = _given_faces(points, clean, faces)
+    try:
+        mesh, length = sheet_mesh(cloud, given, asked)
+    except ValueError as error:
+        if asked is None or asked >= (apart := neighbour_distance(cloud)):
+            raise
+        raise ValueError(
+            f"hole_length is {hole_length:g}, but neighbours are some {apart * size:.3g} apart; raise it."
+        ) from error
     rectangle: Rectangle = rectangle_around(mesh.flat)
     on_sheet = mesh.away <= length
     places = np.clip(mesh.places @ rectangle.axes.T - rectangle.corner, 0.0, rectangle.sides)

@@ -178,8 +178,12 @@ def _level(cloud: np.ndarray, length: float | None) -> tuple[SheetMesh, float]:
 
 
 def _hole_length(nodes: np.ndarray) -> float:
+    return HOLE_SPACINGS * neighbour_distance(nodes, COMMON_SPACING)
+
+
+def neighbour_distance(nodes: np.ndarray, share: int = 50) -> float:
+    """From its sixth neighbour, so many per cent of the nodes are at most this far."""
     from scipy.spatial import cKDTree
 
-    count = min(7, len(nodes))
-    sixth = cKDTree(nodes).query(nodes, count)[0][:, -1]
-    return HOLE_SPACINGS * float(np.percentile(sixth, COMMON_SPACING))
+    sixth = cKDTree(nodes).query(nodes, min(7, len(nodes)))[0][:, -1]
+    return float(np.percentile(sixth, share))

@@ -36,7 +36,7 @@ def largest_piece(points: Float[Any, "points 3"], faces: Faces) -> Faces:
     if not len(faces):
         raise ValueError(
             "points must be dense enough to tell their neighbours, but no triangles could be made of them; "
-            "give more points, or a boundary."
+            "give more points, a boundary, or a larger hole_length."
         )
     piece = pieces(faces)
     many = np.bincount(piece) > FEW * np.bincount(piece).max()

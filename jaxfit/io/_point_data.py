@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 
 from jaxfit._base import Boundary
 
+MOST_COLUMNS = 16  # without names: coordinates, colours and the ten fields of LAS; more are heights
+
 
 class InputError(ValueError):
     """A file cannot be used; the message is one sentence that names it and says what to do.

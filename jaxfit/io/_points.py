@@ -12,7 +12,7 @@ from jaxtyping import Float
 from jaxfit._base import Boundary
 from jaxfit._checks import said_missing
 from jaxfit.io._arrays import load_arrays
-from jaxfit.io._point_data import InputError, PointData, grid_data
+from jaxfit.io._point_data import MOST_COLUMNS, InputError, PointData, grid_data
 from jaxfit.io._scans import SCANS, read_scan
 from jaxfit.io._text import read_columns
 
@@ -29,7 +29,8 @@ def read_points(path: str | os.PathLike) -> PointData:
       ``boundary_u0``, ``boundary_u1`` (see `jaxfit.Boundary`); other keys are ignored, and so are ``points``
       beside a ``grid``
     - ``.npy``: one array, (N, 3) scattered or (n, m, 3) grid
-    - ``.csv``: scattered, one point a line, commas or semicolons; a first line may hold names
+    - ``.csv``: scattered, one point a line, commas, semicolons or tabs; a first line may hold names, of more
+      than three columns those of x, y and z (also ``X [mm]``, ``x_mm``, ...) wherever they stand
     - ``.xyz``, ``.txt``: the same with blanks instead of commas
     - ``.ply``, ``.stl``, ``.obj``, ``.off``: the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
       ``.off`` without faces (trimesh)
@@ -37,8 +38,8 @@ def read_points(path: str | os.PathLike) -> PointData:
     - ``.e57``: all scans, in the frame of the file (pye57)
     - ``.pcd``: fields x, y and z (pypcd4)
 
-    Columns after the third are ignored everywhere, blank lines and lines that begin with ``#``
-    in text files. Coordinates become float64; units and large offsets stay as they are.
+    Other columns, blank lines and lines that begin with ``#`` are ignored. Coordinates become float64;
+    units and large offsets stay as they are.
 
     Those that name a library need the extra ``scan``. Some of them say of points that they are no
     measurements, by a flag or by NaN, and meshes may repeat a vertex (STL: in every triangle). Such points
@@ -57,8 +58,9 @@ def read_points(path: str | os.PathLike) -> PointData:
     ------
     InputError
         For a missing or unreadable file, an unknown suffix, a library that is not installed, arrays of
-        the wrong shape, text that holds no numbers, NaN or infinite coordinates in NumPy's and text files,
-        fewer than four points, and a boundary that is incomplete or whose corners do not meet.
+        the wrong shape, text that holds no numbers, more than three named columns without x, y and z, NaN or
+        infinite coordinates in NumPy's and text files, fewer than four points, and a boundary that is
+        incomplete or whose corners do not meet.
 
     Examples
     --------
@@ -145,6 +147,11 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
     shape, ndim = ("(n, m, 3)", 3) if key == "grid" else ("(N, 3)", 2)
     if key == "points" and array.ndim == 2 and len(array) == 3 and array.shape[1] > _LEAST_POINTS:
         raise InputError(f"{path}: points has shape {array.shape}; it must be (N, 3): store the transpose.")
+    if key == "points" and array.ndim == 2 and array.shape[1] > MOST_COLUMNS:
+        raise InputError(
+            f"{path}: points has shape {array.shape}; it must be (N, 3), or a grid (n, m, 3) if these are "
+            "heights."
+        )
     array = _coordinates(array, key, ndim, shape, path)
     if array.size < 3 * _LEAST_POINTS:
         raise InputError(

@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit.io._point_data import InputError
+from jaxfit.io._point_data import MOST_COLUMNS, InputError
 
 FIRST = 0, 1, 2
+_SAID = 8  # names of columns in a sentence
 _DELIMITERS = {",": "commas", ";": "semicolons", None: "blanks"}
+_UNIT = r"(?:[_\s](?:[munkcdµμ]?m|in|ft)|\s*[/(\[#].*)?"  # of a name: x_mm, x mm, X [mm], X (mm), x/mm
 
 
 def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
-    """The columns x, y and z of a text file, or the first three: between semicolons if its first line has
-    some, else commas in .csv, blanks otherwise.
+    """The columns x, y and z of a text file, or the first three: between semicolons if its first point has
+    some, else commas in .csv, blanks otherwise and where a .csv has tabs.
 
     Raises
     ------
@@ -32,14 +34,24 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
         for number, line in enumerate(text.splitlines(), start=1)
         if (stripped := line.strip()) and not stripped.startswith("#")
     ]
-    delimiter = "," if path.suffix.lower() == ".csv" else None
-    if lines and ";" in lines[0][1].split("#")[0]:
-        delimiter = ";"
-    names = lines.pop(0)[1].split(delimiter) if lines and _is_header(lines[0][1]) else []
+    header = lines.pop(0)[1] if lines and _is_header(lines[0][1]) else ""
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
+    first = lines[0][1].split("#")[0]
+    tabs = "\t" in first and "," not in first
+    delimiter = ";" if ";" in first else "," if path.suffix.lower() == ".csv" and not tabs else None
+    names, found = _names(header, delimiter), len(first.split(delimiter))
     _check_commas(path, [line for _, line in lines], delimiter, len(names))
-    columns = _columns(names)
+    named = _axes(names)
+    if named is None or (named != FIRST and delimiter is None and len(names) > found):
+        _check_names(path, names, found)
+        if found > MOST_COLUMNS:
+            raise InputError(
+                f"{path} has {found} columns without names; give one point x,y,z a line, or name the "
+                "columns, or write the heights as a grid (n, m, 3) in .npy."
+            )
+        named = None
+    columns = named or FIRST
     try:
         values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=columns)
     except ValueError as error:
@@ -52,17 +64,37 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
             f"coordinates, the first in line {lines[int(np.argmin(good))][0]}; remove or repair "
             "them."
         )
-    if columns == FIRST:
-        _check_first_column(path, values[:, 0], len(lines[0][1].split("#")[0].split(delimiter)))
+    if named is None:
+        _check_first_column(path, values[:, 0], found)
     return values
 
 
-def _columns(names: list[str]) -> tuple[int, int, int]:
-    """Those named x, y and z, if each is there once, else the first three."""
-    named = [name.strip().strip("\"'").lower() for name in names]
-    if any(named.count(name) != 1 for name in "xyz"):
-        return FIRST
-    return named.index("x"), named.index("y"), named.index("z")
+def _names(header: str, delimiter: str | None) -> list[str]:
+    """The names of columns, of which none is an empty one at the end."""
+    between = delimiter or next((x for x in "\t;," if x in header), None)
+    if between is None:  # a unit in brackets is no column of its own
+        header = re.sub(r"\s*[(\[].*?[)\]]", "", header)
+    return header.rstrip(f"{between or ''} \t").split(between)
+
+
+def _axes(names: list[str]) -> tuple[int, int, int] | None:
+    """Which columns are named x, y and z, each once: without a unit, or else with one."""
+    for unit in ("", _UNIT):
+        pattern = rf"""["'/\s]*([xyz]){unit}["'\s]*"""
+        found = [re.fullmatch(pattern, name, re.IGNORECASE) for name in names]
+        axes = [match[1].lower() if match else "" for match in found]
+        if all(axes.count(axis) == 1 for axis in "xyz"):
+            return axes.index("x"), axes.index("y"), axes.index("z")
+    return None
+
+
+def _check_names(path: Path, names: list[str], found: int) -> None:
+    """Raise if more than three columns have names, but not x, y and z."""
+    if len(names) > 3 and found > 3:
+        said = ", ".join(name.strip(" \"'") or "''" for name in names[:_SAID])
+        said += ", ..." * (len(names) > _SAID)
+        but = "" if len(names) == found else f", but has {found}"
+        raise InputError(f"{path} names its columns {said}{but}; name three of them x, y and z.")
 
 
 def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: int) -> None:
@@ -88,7 +120,7 @@ def _check_first_column(path: Path, first: np.ndarray, columns: int) -> None:
     if columns >= 4 and len(first) >= 4 and first[0] in (0, 1) and (np.diff(first) == 1).all():
         raise InputError(
             f"{path}: the first column only counts the points, from {first[0]:.0f} to {first[-1]:.0f}; "
-            "remove it, so that x, y and z come first."
+            "remove it, or name the columns x, y and z in the first line."
         )
 
 
@@ -110,13 +142,20 @@ def _explain(
     """The sentence for the first line that cannot be read (NumPy counts other lines)."""
     for number, line in lines:
         cells = line.split("#")[0].split(delimiter)
-        if len(cells) <= max(columns):
+        short = len(cells) <= max(columns)
+        wrong = [] if short else [x for x in (cells[k] for k in columns) if not _is_number(x)]
+        if not (short or wrong):
+            continue
+        if line is lines[0][1] and any(_is_header(x) for _, x in lines[:2]):
+            return (
+                f"{path}: line {number} is no point, and only one line of names may come first; put # before "
+                "the others."
+            )
+        if short:
             hint, least = _DELIMITERS[delimiter], max(columns) + 1
             return (
                 f"{path}: line {number} has {len(cells)} column{'s' * (len(cells) != 1)}, but a "
                 f"point has {'three' if least == 3 else least}; separate x, y and z by {hint}."
             )
-        for cell in (cells[column] for column in columns):
-            if not _is_number(cell):
-                return f"{path}: line {number} has {cell.strip()!r} in place of a number; mend it."
+        return f"{path}: line {number} has {wrong[0].strip()!r} in place of a number; mend it."
     return f"{path} is not a table of numbers; write one point a line."
