@@ -57,14 +57,8 @@ CALLS = {
     "Meshless": lambda: jf.fit_points(POINTS, BOUNDARY, net=(11, 7), base=jf.Meshless(), order=(3, 4)),
     "a grid": lambda: jf.interpolate(wavy_grid(13, 5), order=(3, 4)),
     "Chebyshev": lambda: jf.interpolate(wavy_grid(5, 13), CHEBYSHEV),
-    "a gradient": lambda: jax.grad(error)(jnp.asarray(POINTS)),
 }
 LARGE = ("_advance", "_run", "polished_fit", "_linearised")
-
-
-def error(points):
-    options = dict(net=(7, 6), method=jf.OrthogonalDistance(smoothing=1e-4), tol_average=1e-12)
-    return jf.fit_points(points, BOUNDARY, **options).average_error
 
 
 @pytest.mark.parametrize("name", slow_except(CALLS, "a net given", "a grid"))
@@ -75,6 +69,22 @@ def test_fits_compile_ahead_and_no_program_in_vain(name, monkeypatch):
         CALLS[name]()
     large = [program for program in found.names if any(name in program for name in LARGE)]
     assert 0 < len(large) == len(set(large)) == len(waited)
+
+
+@pytest.mark.slow
+def test_a_gradient_compiles_ahead_and_no_zeros(monkeypatch):
+    def error(points):
+        options = dict(net=(7, 6), method=jf.OrthogonalDistance(smoothing=1e-4), tol_average=1e-12)
+        return jf.fit_points(points, BOUNDARY, **options).average_error
+
+    waited = []
+    monkeypatch.setattr(_compile_ahead, "wait", lambda futures: waited.append(futures[0].result()))
+    with count_compilations() as found:
+        jax.grad(error)(jnp.asarray(POINTS))
+    large = [program for program in found.names if any(name in program for name in LARGE)]
+    # The loop is not begun: the method might have no derivative.
+    assert len(large) == len(set(large)) == len(waited) + 1 == 4
+    assert sum("broadcast_in_dim" in program for program in found.names) < 5
 
 
 def test_a_method_without_a_derivative_says_so_before_its_loop_compiles():

@@ -111,12 +111,18 @@ def with_implicit_derivative(
     return fitted
 
 
-@with_implicit_derivative.defjvp
+@partial(with_implicit_derivative.defjvp, symbolic_zeros=True)
 def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any) -> Any:
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), tangents[2:])
+    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), (_with_zeros(tangents[2]),))
+
+
+def _with_zeros(tangents: Any) -> Any:
+    """Tangents with zeros of NumPy, which compile nothing, for those that are known to be zero."""
+    zero = jax.custom_derivatives.SymbolicZero
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype) if isinstance(x, zero) else x, tangents)
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
@@ -192,11 +198,11 @@ def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitI
     return _fitted(rest, at_rest, end, inputs)
 
 
-@_fitted_at_rest.defjvp
+@partial(_fitted_at_rest.defjvp, symbolic_zeros=True)
 def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
     fitted, maps = _linearised(rest, at_rest, end, differentiated(inputs))
-    return fitted, _along(maps, at_rest.system, tangents[2])
+    return fitted, _along(maps, at_rest.system, _with_zeros(tangents[2]))
 
 
 @partial(compiled, kept=True, static_argnums=0)
