@@ -241,7 +241,7 @@ def test_arrays_that_are_no_points(tmp_path, arrays, said):
 def test_coordinates_that_are_no_numbers(tmp_path):
     points = POINTS.copy()
     points[[2, 5], 1] = np.nan, np.inf
-    assert "2 of 8 points in points" in sentence(npz(tmp_path / "a.npz", points=points))
+    assert "2 of 8 points in array 'points'" in sentence(npz(tmp_path / "a.npz", points=points))
     assert "first at index 2;" in sentence(npz(tmp_path / "a.npz", points=points))
     grid = points.reshape(2, 4, 3)
     assert "first at index 0, 2;" in sentence(npz(tmp_path / "a.npz", grid=grid))
@@ -253,7 +253,7 @@ def test_a_bad_boundary_is_refused(tmp_path):
     arrays["boundary_v0"] = arrays["boundary_v0"][::-1]
     assert "corner" in sentence(npz(tmp_path / "a.npz", points=points, **arrays))
     arrays["boundary_v0"] = np.full((4, 3), np.nan)
-    assert "4 of 4 points in boundary_v0" in sentence(npz(tmp_path / "a.npz", points=points, **arrays))
+    assert "4 of 4 points in array 'boundary_v0'" in sentence(npz(tmp_path / "a.npz", points=points, **arrays))
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def _coordinates(
     if not good.all():
         first = np.argwhere(~good)[0]
         raise InputError(
-            f"{path}: {int((~good).sum())} of {good.size} points in {key} have NaN or infinite "
+            f"{path}: {int((~good).sum())} of {good.size} points in array '{key}' have NaN or infinite "
             f"coordinates, the first at index {', '.join(str(int(i)) for i in first)}; "
             f"{'remove or repair them' if array.ndim == 2 else 'write the others as points (N, 3)'}."
         )
