@@ -2,12 +2,13 @@
 
 The calls are `closest_point`, `interpolate` and `approximate` with each method, on a made cloud of 3,000
 points, a 16 x 14 net and a grid of 20 x 24 points. The first call compiles; the later one is the median of
-three in the same process. The environment variable JAXFIT_OTHER may name a second checkout of jaxfit: both
-then take turns, to meet the same machine.
+three in the same process, whose peak memory is that of all of them. The environment variable JAXFIT_OTHER may
+name a second checkout of jaxfit: both then take turns, to meet the same machine.
 """
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -42,21 +43,18 @@ class Data:
 
 
 def closest(jf, data):
-    """Arrays of a closest-point search."""
-    feet = jf.closest_point(data.base, data.cloud)
-    return feet.u, feet.v, feet.distance
+    """Closest points of the cloud."""
+    return jf.closest_point(data.base, data.cloud)
 
 
 def interpolated(jf, data, method):
-    """Arrays of a surface through the grid."""
-    fit = jf.interpolate(data.grid, method)
-    return fit.surface.control_points, fit.errors
+    """A surface through the grid."""
+    return jf.interpolate(data.grid, method)
 
 
 def approximated(jf, data, method):
-    """Arrays of a surface near the cloud."""
-    fit = jf.approximate(data.cloud, data.base, method, tol_average=2e-4, max_steps=50)
-    return fit.surface.control_points, fit.errors
+    """A surface near the cloud."""
+    return jf.approximate(data.cloud, data.base, method, tol_average=2e-4, max_steps=50)
 
 
 CALLS = {
@@ -71,7 +69,7 @@ CALLS = {
 
 
 def measured(name):
-    """In a process of its own: seconds of the first call and of a later one, and where jaxfit lies."""
+    """In a process of its own: seconds of the first and of a later call, MiB, errors, and where jaxfit lies."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -81,9 +79,25 @@ def measured(name):
     data, seconds = Data(jf), []
     for _ in range(1 + LATER):
         begun = time.perf_counter()
-        jax.block_until_ready(CALLS[name](jf, data))
+        result = jax.block_until_ready(CALLS[name](jf, data))
         seconds.append(time.perf_counter() - begun)
-    return {"first": seconds[0], "later": float(np.median(seconds[1:])), "file": jf.__file__}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    times = {"first": seconds[0], "later": float(np.median(seconds[1:])), "peak": peak}
+    return {**times, "errors": errors(name, data, result), "file": jf.__file__}
+
+
+def errors(name, data, result):
+    """By the referee: of closest points, how much farther they are than its own."""
+    sys.path.insert(0, str(HERE))
+    from benchmarks._referee import distances, folds, judged
+
+    surface = data.base if name == "closest point" else result.surface
+    surface = surface.control_points, (surface.knots_u, surface.knots_v)
+    if name != "closest point":
+        return judged(*surface, data.grid if name.startswith("interpolate") else data.cloud)
+    farther = np.maximum(np.asarray(result.distance) - distances(*surface, data.cloud), 0.0)
+    farther *= 100 / np.linalg.norm(np.ptp(data.cloud, axis=0))
+    return {"average %": farther.mean(), "maximum %": farther.max(), "folds": folds(*surface)}
 
 
 def in_new_process(name, checkout):
@@ -98,12 +112,16 @@ def in_new_process(name, checkout):
     found = json.loads(done.stdout.splitlines()[-1])
     if not Path(found["file"]).is_relative_to(checkout):
         sys.exit(f"{checkout} has no jaxfit: {found['file']} was imported")
-    return found["first"], found["later"]
+    return found
 
 
 def calls(report, options):
     """First and later calls of the public entries."""
-    report.table("First calls", "Seconds; medians over the processes, the first call with its spread.")
+    note = (
+        "Seconds; medians over the processes, the first call with its spread. Peak memory is in MiB. Errors "
+    )
+    note += "of closest points are how much farther they are than the referee's."
+    report.table("First calls", note)
     checkouts = {"this": HERE}
     if os.environ.get("JAXFIT_OTHER"):
         checkouts["other"] = Path(os.environ["JAXFIT_OTHER"]).resolve()
@@ -113,7 +131,7 @@ def calls(report, options):
             for key, checkout in checkouts.items():
                 times[key].append(in_new_process(name, checkout))
         for key, found in times.items():
-            first, later = np.transpose(found)
+            first, later, peak = (np.array([x[key] for x in found]) for key in ("first", "later", "peak"))
             report.row(
                 call=name,
                 checkout=key,
@@ -121,10 +139,12 @@ def calls(report, options):
                 lowest_s=float(first.min()),
                 highest_s=float(first.max()),
                 later_s=float(np.median(later)),
+                peak_MiB=float(np.median(peak)),
+                **found[0]["errors"],
             )
 
 
 PARTS = {"calls": calls}
 
 if __name__ == "__main__":
-    print(json.dumps(measured(sys.argv[1])))
+    print(json.dumps(measured(sys.argv[1]), default=float))

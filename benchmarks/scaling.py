@@ -72,6 +72,8 @@ def _scaled(report, options, sizes, what, row):
     lines = {name: [row(size, name) for size in sizes] for name in METHODS}
     for name, times in lines.items():
         last = len(sizes) // 2
+        if len(sizes) < 4:  # no slope of two halves
+            continue
         slopes = [_slope(sizes[part], times[part]) for part in (slice(None), slice(last, None))]
         growth = f"{what}^{slopes[0]:.2f}, from {sizes[last]:,} on like {what}^{slopes[1]:.2f}"
         report.remark(f"{name}: the time of all cores in a pass grows like {growth}.")

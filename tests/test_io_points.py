@@ -140,6 +140,13 @@ def test_names_may_have_units(tmp_path, name, header):
     np.testing.assert_array_equal(read_points(text(tmp_path / name, f"{header}\n{rows}\n")).points, POINTS)
 
 
+@pytest.mark.parametrize("rows", ["p 1\t{}\t5", "\t{}\t5"])  # a blank is no tab, nor is an empty cell nothing
+def test_tabs_separate_columns_of_a_csv(tmp_path, rows):
+    content = "".join(rows.format("\t".join(map(repr, row))) + "\n" for row in POINTS.tolist())
+    found = read_points(text(tmp_path / "a.csv", "label\tx\ty\tz\tI\n" + content))
+    np.testing.assert_array_equal(found.points, POINTS)
+
+
 @pytest.mark.parametrize(
     ("name", "header", "said"),
     [
@@ -148,6 +155,7 @@ def test_names_may_have_units(tmp_path, name, header):
         ("a.csv", "x (m),y (m),x (px),y (px)", "its columns x (m), y (m), x (px), y (px); name"),
         ("a.csv", "nr,x_normal,y_normal,z_normal", "nr, x_normal, y_normal, z_normal; name"),
         ("a.xyz", "Point ID x y z", "its columns Point, ID, x, y, z, but has 4; name three"),
+        ("a.txt", "ID mm z mm y mm x mm", "z, mm, y, mm, x, mm, but has 4; name three of them x, y and z"),
     ],
 )
 def test_names_that_do_not_tell_the_axes_are_refused(tmp_path, name, header, said):

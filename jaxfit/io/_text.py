@@ -10,13 +10,13 @@ from jaxfit.io._point_data import MOST_COLUMNS, InputError
 
 FIRST = 0, 1, 2
 _SAID = 8  # names of columns in a sentence
-_DELIMITERS = {",": "commas", ";": "semicolons", None: "blanks"}
+_DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", None: "blanks"}
 _UNIT = r"(?:[_\s](?:[munkcdµμ]?m|in|ft)|\s*[/(\[#].*)?"  # of a name: x_mm, x mm, X [mm], X (mm), x/mm
 
 
 def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     """The columns x, y and z of a text file, or the first three: between semicolons if its first point has
-    some, else commas in .csv, blanks otherwise and where a .csv has tabs.
+    some, else commas or tabs in .csv, blanks otherwise.
 
     Raises
     ------
@@ -38,13 +38,15 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
     first = lines[0][1].split("#")[0]
-    tabs = "\t" in first and "," not in first
-    delimiter = ";" if ";" in first else "," if path.suffix.lower() == ".csv" and not tabs else None
+    delimiter = ";" if ";" in first else None
+    if delimiter is None and path.suffix.lower() == ".csv":
+        delimiter = "\t" if "\t" in first and "," not in first else ","
     names, found = _names(header, delimiter), len(first.split(delimiter))
     _check_commas(path, [line for _, line in lines], delimiter, len(names))
     named = _axes(names)
-    if named is None or (named != FIRST and delimiter is None and len(names) > found):
-        _check_names(path, names, found)
+    title = named is not None and delimiter is None and len(names) > found  # words, or names of no columns
+    if named is None or (title and named != FIRST):
+        _check_names(path, names, found, title and np.diff(named).tolist() != [1, 1])
         if found > MOST_COLUMNS:
             raise InputError(
                 f"{path} has {found} columns without names; give one point x,y,z a line, or name the "
@@ -71,7 +73,8 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
 
 def _names(header: str, delimiter: str | None) -> list[str]:
     """The names of columns, of which none is an empty one at the end."""
-    between = delimiter or next((x for x in "\t;," if x in header), None)
+    between = delimiter if delimiter and delimiter in header else None
+    between = between or next((x for x in "\t;," if x in header), delimiter)
     if between is None:  # a unit in brackets is no column of its own
         header = re.sub(r"\s*[(\[].*?[)\]]", "", header)
     return header.rstrip(f"{between or ''} \t").split(between)
@@ -88,9 +91,11 @@ def _axes(names: list[str]) -> tuple[int, int, int] | None:
     return None
 
 
-def _check_names(path: Path, names: list[str], found: int) -> None:
-    """Raise if more than three columns have names, but not x, y and z."""
-    if len(names) > 3 and found > 3:
+def _check_names(path: Path, names: list[str], found: int, mixed: bool) -> None:
+    """Raise if more than three columns have names, but not x, y and z, or these in a `mixed` order of which
+    nothing says where it begins.
+    """
+    if mixed or (len(names) > 3 and found > 3):
         said = ", ".join(name.strip(" \"'") or "''" for name in names[:_SAID])
         said += ", ..." * (len(names) > _SAID)
         but = "" if len(names) == found else f", but has {found}"
