@@ -69,7 +69,7 @@ CALLS = {
 
 
 def measured(name):
-    """In a process of its own: seconds of the first and of a later call, MiB, errors, and where jaxfit lies."""
+    """In a process of its own: seconds of the first and a later call, memory, errors, where jaxfit lies."""
     import jax
 
     jax.config.update("jax_enable_x64", True)

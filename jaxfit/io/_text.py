@@ -44,9 +44,10 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     names, found = _names(header, delimiter), len(first.split(delimiter))
     _check_commas(path, [line for _, line in lines], delimiter, len(names))
     named = _axes(names)
-    title = named is not None and delimiter is None and len(names) > found  # words, or names of no columns
+    title = delimiter is None and len(names) > found  # words, or names that are no columns
     if named is None or (title and named != FIRST):
-        _check_names(path, names, found, title and np.diff(named).tolist() != [1, 1])
+        mixed = named is not None and np.diff(named).tolist() != [1, 1]
+        _check_names(path, names, found, mixed)
         if found > MOST_COLUMNS:
             raise InputError(
                 f"{path} has {found} columns without names; give one point x,y,z a line, or name the "
