@@ -38,22 +38,10 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
     first = lines[0][1].split("#")[0]
-    delimiter = ";" if ";" in first else None
-    if delimiter is None and path.suffix.lower() == ".csv":
-        delimiter = "\t" if "\t" in first and "," not in first else ","
+    delimiter = _delimiter(path, first)
     names, found = _names(header, delimiter), len(first.split(delimiter))
     _check_commas(path, [line for _, line in lines], delimiter, len(names))
-    named = _axes(names)
-    title = delimiter is None and len(names) > found  # words, or names that are no columns
-    if named is None or (title and named != FIRST):
-        mixed = named is not None and np.diff(named).tolist() != [1, 1]
-        _check_names(path, names, found, mixed)
-        if found > MOST_COLUMNS:
-            raise InputError(
-                f"{path} has {found} columns without names; give one point x,y,z a line, or name the "
-                "columns, or write the heights as a grid (n, m, 3) in .npy."
-            )
-        named = None
+    named = _named_columns(path, names, found, title=delimiter is None and len(names) > found)
     columns = named or FIRST
     try:
         values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=columns)
@@ -70,6 +58,37 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     if named is None:
         _check_first_column(path, values[:, 0], found)
     return values
+
+
+def _delimiter(path: Path, first: str) -> str | None:
+    """What separates the columns of the first point, None for blanks."""
+    if ";" in first:
+        return ";"
+    if path.suffix.lower() != ".csv":
+        return None
+    return "\t" if "\t" in first and "," not in first else ","
+
+
+def _named_columns(path: Path, names: list[str], found: int, title: bool) -> tuple[int, int, int] | None:
+    """The columns that are named x, y and z; None for the first three, where the names say nothing else.
+
+    There are more words in a `title` than columns were `found`, so that nobody knows which belong to one.
+    """
+    named = _axes(names)
+    if named is not None and (named == FIRST or not title):
+        return named
+    mixed = named is not None and np.diff(named).tolist() != [1, 1]
+    if mixed or (len(names) > 3 and found > 3):
+        said = ", ".join(name.strip(" \"'") or "''" for name in names[:_SAID])
+        said += ", ..." * (len(names) > _SAID)
+        but = "" if len(names) == found else f", but has {found}"
+        raise InputError(f"{path} names its columns {said}{but}; name three of them x, y and z.")
+    if found > MOST_COLUMNS:
+        raise InputError(
+            f"{path} has {found} columns without names; give one point x,y,z a line, or name the columns, or "
+            "write the heights as a grid (n, m, 3) in .npy."
+        )
+    return None
 
 
 def _names(header: str, delimiter: str | None) -> list[str]:
@@ -90,17 +109,6 @@ def _axes(names: list[str]) -> tuple[int, int, int] | None:
         if all(axes.count(axis) == 1 for axis in "xyz"):
             return axes.index("x"), axes.index("y"), axes.index("z")
     return None
-
-
-def _check_names(path: Path, names: list[str], found: int, mixed: bool) -> None:
-    """Raise if more than three columns have names, but not x, y and z, or these in a `mixed` order of which
-    nothing says where it begins.
-    """
-    if mixed or (len(names) > 3 and found > 3):
-        said = ", ".join(name.strip(" \"'") or "''" for name in names[:_SAID])
-        said += ", ..." * (len(names) > _SAID)
-        but = "" if len(names) == found else f", but has {found}"
-        raise InputError(f"{path} names its columns {said}{but}; name three of them x, y and z.")
 
 
 def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: int) -> None:
