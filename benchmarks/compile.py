@@ -91,7 +91,7 @@ def errors(name, data, result):
     sys.path.insert(0, str(HERE))
     from benchmarks._referee import distances, folds, judged
 
-    surface = data.base if name == "closest point" else result.surface
+    surface = getattr(result, "surface", data.base)
     surface = surface.control_points, (surface.knots_u, surface.knots_v)
     if name != "closest point":
         return judged(*surface, data.grid if name.startswith("interpolate") else data.cloud)

@@ -77,12 +77,11 @@ def fit_cloud(
     together = problem.ordered(order)
     _announce(base.shape, cloud.shape[0], room)
     loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
+    first = _end(together, begun, loop, order, unit, begun)
     unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
     if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
-        first = _end(together, begun, loop, order, unit, begun)
         _prepare_derivative((cloud, base, method, request), first, concrete, not is_concrete(given))
     if unrolled:
-        first = _end(together, begun, loop, order, unit, begun)
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
         cloud, base, method, concrete = *given[:3], is_concrete(given)
     else:

@@ -225,7 +225,7 @@ def _linearised(
     return fitted, (along_inputs, along_net)
 
 
-@jax.jit
+@compiled
 def _along(maps: tuple[LinearMap, LinearMap], system: NewtonSystem, change: FitInputs) -> Fitted:
     """The derivative along a change of the inputs."""
     along_inputs, along_net = maps
