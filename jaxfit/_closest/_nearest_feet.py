@@ -136,7 +136,10 @@ class _Projector:
         self.pieces  # noqa: B018 (before there are threads)
         chosen = self.centred if which is None else self.centred[:, which]
         one = partial(self._feet_of_chunk, np.asarray(borders))
-        return in_chunks(one, (chosen, np.asarray(u), np.asarray(v)), self.size)
+        u, v = np.asarray(u), np.asarray(v)
+        # A chunk of neighbours has fuller rows and stays in fewer cells.
+        order = neighbours_together(*self.axes, u, v) if u.size > self.size else None
+        return in_chunks(one, (chosen, u, v), self.size, order)
 
     def _feet_of_chunk(self, borders: np.ndarray, *inputs: np.ndarray) -> dict[str, Array]:
         idle = np.arange(self.size) >= inputs[0].shape[-1]
@@ -178,6 +181,7 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
 
 def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, best: HostFeet) -> None:
     """Start from every sample that may lead to a nearer foot of the points `left`."""
+    left = left[neighbours_together(*projector.axes, best["u"][left], best["v"][left])]  # quicker in the tree
     distance = np.sqrt(best["f"][left].astype(np.float64))
     points = np.ascontiguousarray(projector.centred.T[left])
     candidates = search.candidates(points, best["u"][left], best["v"][left], distance)
@@ -221,9 +225,11 @@ def chunk_size(count: int) -> int:
     return CHUNK if jax.default_backend() == "cpu" and count > CHUNK else bucket(count)
 
 
-def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostFeet:
-    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core;
-    the results are put together.
+def in_chunks(
+    function: Any, arrays: tuple[np.ndarray, ...], size: int, order: np.ndarray | None = None
+) -> HostFeet:
+    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core; the
+    results are put together. The parts are cut from the entries in this `order`.
     """
     count = arrays[0].shape[-1]
     number, threads = -(-count // size), cores()
@@ -231,16 +237,36 @@ def in_chunks(function: Any, arrays: tuple[np.ndarray, ...], size: int) -> HostF
         number = -(-number // threads) * threads
     step = -(-count // number)
     parts = [slice(begin, min(begin + step, count)) for begin in range(0, count, step)]
+    whole: HostFeet = {}
 
     def one(part: slice) -> HostFeet:
-        found = function(*(x[..., part] for x in arrays))
-        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in found.items()}
+        cut = (x[..., part] if order is None else x.take(order[part], axis=-1) for x in arrays)
+        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in function(*cut).items()}
 
     if len(parts) == 1:
         return one(parts[0])
     with ThreadPoolExecutor(min(len(parts), threads)) as pool:
         pieces = list(pool.map(one, parts))
-    return {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
+    whole = {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
+    if order is None:
+        return whole
+    back = np.empty_like(order)
+    back[order] = np.arange(count)
+    return {name: x.take(back, axis=-1) for name, x in whole.items()}
+
+
+def neighbours_together(axis_u: Axis, axis_v: Axis, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The order of points in which those of one cell follow one another if knots are uniform, and nearly so
+    if they are not: places in a uniform grid of as many cells take a tenth of the time to find.
+    """
+    number = np.zeros(u.shape, np.int32)
+    for axis, x in ((axis_u, u), (axis_v, v)):
+        first, last = axis.breaks[0], axis.breaks[-1]
+        place = (x - first) * (axis.cells / (last - first))
+        number = number * axis.cells + np.clip(place, 0, axis.cells - 1).astype(np.int32)
+    if axis_u.cells * axis_v.cells < 1 << 16:  # which NumPy sorts in linear time
+        number = number.astype(np.uint16)
+    return np.argsort(number, kind="stable")
 
 
 def _middle(net: np.ndarray) -> np.ndarray:
