@@ -228,8 +228,8 @@ def chunk_size(count: int) -> int:
 def in_chunks(
     function: Any, arrays: tuple[np.ndarray, ...], size: int, order: np.ndarray | None = None
 ) -> HostFeet:
-    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core; the
-    results are put together. The parts are cut from the entries in this `order`.
+    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core;
+    the results are put together. The parts are cut from the entries in this `order`.
     """
     count = arrays[0].shape[-1]
     number, threads = -(-count // size), cores()
