@@ -74,9 +74,10 @@ def compile_search_ahead(
     _Projector(method, net, (axis_u, axis_v), np.zeros((1, net.shape[2])), 0.0, 1, chunk).compile_ahead()
 
 
-@partial(compiled, kept=True, static_argnums=0)
+@partial(compiled, kept=True, static_argnums=(0, 1))
 def _run(
     method: AbstractFootMethod,
+    borders: bool,
     pieces: Pieces,
     target: Array,
     u: Array,
@@ -84,8 +85,8 @@ def _run(
     idle: Array,
     tolerance: Array,
     max_steps: Array,
-    borders: Array,
 ) -> dict[str, Array]:
+    """Local feet, also on the `borders`: few clouds have feet that need them, so that is another program."""
     feet = project(method, pieces, target, u, v, tolerance, max_steps, idle, borders)
     return {
         "u": feet.best_u,
@@ -128,23 +129,22 @@ class _Projector:
         """Begin to compile the program that the calls take, if that has not been done."""
         nothing = np.zeros((self.net.shape[2], self.size), self.dtype)
         idle = np.zeros(self.size, bool)
-        borders = np.asarray(False)
-        _run.ahead(self.method, self.pieces, nothing, nothing[0], nothing[0], idle, *self.limits, borders)
+        _run.ahead(self.method, False, self.pieces, nothing, nothing[0], nothing[0], idle, *self.limits)
 
     def __call__(self, which: Any, u: Any, v: Any, borders: bool = False) -> HostFeet:
         """Feet of the points `which` (None: all) from (u, v)."""
         self.pieces  # noqa: B018 (before there are threads)
         chosen = self.centred if which is None else self.centred[:, which]
-        one = partial(self._feet_of_chunk, np.asarray(borders))
+        one = partial(self._feet_of_chunk, borders)
         u, v = np.asarray(u), np.asarray(v)
         # A chunk of neighbours has fuller rows and stays in fewer cells.
         order = neighbours_together(*self.axes, u, v) if u.size > self.size else None
         return in_chunks(one, (chosen, u, v), self.size, order)
 
-    def _feet_of_chunk(self, borders: np.ndarray, *inputs: np.ndarray) -> dict[str, Array]:
+    def _feet_of_chunk(self, borders: bool, *inputs: np.ndarray) -> dict[str, Array]:
         idle = np.arange(self.size) >= inputs[0].shape[-1]
         inputs = tuple(padded(x, self.size).astype(self.dtype, copy=False) for x in inputs)
-        return _run(self.method, self.pieces, *inputs, idle, *self.limits, borders)
+        return _run(self.method, borders, self.pieces, *inputs, idle, *self.limits)
 
 
 def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostFeet:
