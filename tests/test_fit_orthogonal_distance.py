@@ -16,7 +16,7 @@ from jaxfit._approximation._damping import (
     next_damping,
     within_reach,
 )
-from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._approximation._distance_rows import normal_equations, rows_with_influence
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._fit._problem import Tolerances, make_problem
 from jaxfit._fit._scaling import unit_of
@@ -57,7 +57,9 @@ def laid_out(base):
 
     @jax.jit
     def compute(problem, net, u, v, weight, mu):
-        return normal_equations(problem, pieces_on(net, *axes), u, v, weight, mu)
+        pieces = pieces_on(net, *axes)
+        rows = rows_with_influence(pieces, u, v, weight)
+        return normal_equations(problem, pieces, rows, u, v, weight, mu)
 
     def rows(mu, counts=1.0):
         weight = jnp.pad(counts * jnp.ones(len(cloud)), (0, pad))
@@ -98,11 +100,12 @@ def test_second_derivatives_along_a_move_are_those_of_the_true_distances(base, l
     problem, net, feet, _ = laid_out
     inside = (feet.u > 0) & (feet.u < 1) & (feet.v > 0) & (feet.v < 1)
     pad = problem.target.shape[1] - len(inside)
-    feet_and_weight = (jnp.pad(x, (0, pad)) for x in (feet.u, feet.v, 1.0 * inside))
+    points = [jnp.pad(x, (0, pad)) for x in (feet.u, feet.v, 1.0 * inside)]
     move, along = np.random.default_rng(3).normal(size=(2, *net.shape))
     axes = jax.tree.map(jnp.asarray, WorkingSurface.of(net, base.knots_u, base.knots_v).axes)
     pieces, moves = (pieces_on(x, *axes) for x in (net, jnp.asarray(move)))
-    pull = jax.jit(second_order_rhs)(problem, pieces, moves, *feet_and_weight)
+    rows = rows_with_influence(pieces, *points)
+    pull = jax.jit(second_order_rhs)(problem, pieces, moves, rows, *points)
     ahead, here, behind = (distances(problem, net + h * move, base, feet) for h in (2e-4, 0.0, -2e-4))
     bent = (ahead - 2 * here + behind) / 4e-8
     expected = -0.5 * jnp.sum(inside * bent * slope(problem, net, base, feet, along))

@@ -28,7 +28,7 @@ from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Rows,
     cells_to_net,
-    evaluate_jet,
+    evaluate_first_order,
     local_coordinates,
     over_blocks,
     row_coefficients,
@@ -53,17 +53,25 @@ class _Sums(eqx.Module):
     right: Float[Array, "cells K Lc"]
 
 
+def rows_with_influence(
+    pieces: Pieces, u: Float[Array, " points"], v: Float[Array, " points"], weight: Float[Array, " points"]
+) -> Rows:
+    """Points with feet (u, v) in rows; points of weight 0 take no part."""
+    pieces = jax.tree.map(jnp.asarray, pieces)
+    return rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), without_influence(weight))
+
+
 def normal_equations(
     problem: Any,
     pieces: Pieces,
+    rows: Rows,
     u: Float[Array, " points"],
     v: Float[Array, " points"],
     weight: Float[Array, " points"],
     damping: Float[Array, ""],
 ) -> NormalEquations:
-    """The normal equations at feet (u, v), for `damping` mu; points of weight 0 take no part."""
+    """The normal equations at feet (u, v), for `damping` mu; `rows` are those of `rows_with_influence`."""
     pieces = jax.tree.map(jnp.asarray, pieces)
-    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), without_influence(weight))
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
     pairs = d * (d + 1) // 2
     always = problem.diagonal > 0
@@ -92,9 +100,10 @@ def _rows_at(
     target, u, v, weight = here[:-3], here[-3], here[-2], jnp.where(filled, here[-1], 0.0)
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
     coefficients = row_coefficients(pieces, part)
-    jet = materialise(u[0, 0] >= pieces.axis_u.breaks[0], evaluate_jet, coefficients, s, t)
-    e = target - jet.value
-    tangential = FootTangents.at(pieces, u, v, e, jet).entries()
+    always = u[0, 0] >= pieces.axis_u.breaks[0]
+    value, *tangents = materialise(always, evaluate_first_order, coefficients, s, t)
+    e = target - value
+    tangential = FootTangents.at(pieces, u, v, e, *tangents).entries()
     d = target.shape[0]
     same = jnp.asarray(np.equal(*np.triu_indices(d)), s.dtype)[:, None, None]
     return s, t, weight[None] * e, weight[None] * (same - (1.0 - damping) * tangential)

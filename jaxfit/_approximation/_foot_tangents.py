@@ -7,7 +7,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._cells import Jet
 from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
 
@@ -29,10 +28,10 @@ class FootTangents(NamedTuple):
     per_second: Float[Array, "..."]
 
     @staticmethod
-    def at(pieces: Pieces, u: Array, v: Array, e: Array, jet: Jet) -> "FootTangents":
-        """At feet (u, v) with residuals `e`."""
-        s = jnp.where(_held(pieces.axis_u, u, e, jet.s)[None], 0.0, jet.s)
-        t = jnp.where(_held(pieces.axis_v, v, e, jet.t)[None], 0.0, jet.t)
+    def at(pieces: Pieces, u: Array, v: Array, e: Array, s: Array, t: Array) -> "FootTangents":
+        """At feet (u, v) with residuals `e` and tangents `s` along u and `t` along v."""
+        s = jnp.where(_held(pieces.axis_u, u, e, s)[None], 0.0, s)
+        t = jnp.where(_held(pieces.axis_v, v, e, t)[None], 0.0, t)
         E, F, G = dot(s, s), dot(s, t), dot(t, t)
         per_first = jnp.where(E > 0, 1.0 / jnp.where(E > 0, E, 1.0), 0.0)
         share = F * per_first

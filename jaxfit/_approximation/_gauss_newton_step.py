@@ -25,7 +25,7 @@ LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 def gauss_newton_step(
     penalty: AbstractPenalty,
-    correction_rhs: Callable[[Array, Array], Array],
+    correction_rhs: Callable[[Array], Array],
     equations: NormalEquations,
     net: Float[Array, "nu nv d"],
     held: Bool[Array, "nu nv"],
@@ -35,7 +35,7 @@ def gauss_newton_step(
 ) -> tuple[Float[Array, "nu nv d"], Float[Array, ""]]:
     """The net after the step, and the predicted reduction of the objective.
 
-    `correction_rhs(net, move)` is the right-hand side of the system that gives the correction of a move; only
+    `correction_rhs(move)` is the right-hand side of the system that gives the correction of a move; only
     steps of `second_order` have one. At damping 1 moves may be longer than `longest`.
     """
     stiffness, bent = penalty.system(net)
@@ -56,7 +56,7 @@ def gauss_newton_step(
         rhs = lax.cond(
             is_step,
             lambda: right,
-            lambda: lax.cond(second_order, lambda: correction_rhs(net, move), lambda: jnp.zeros_like(net)),
+            lambda: lax.cond(second_order, lambda: correction_rhs(move), lambda: jnp.zeros_like(net)),
         )
         solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, most).net
         limited = jnp.where(damped, within_reach(solution, longest), solution)

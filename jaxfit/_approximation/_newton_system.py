@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._approximation._distance_rows import normal_equations, rows_with_influence
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._working_surface import WorkingSurface
@@ -76,7 +76,9 @@ def newton_system(
     condition = method.stationarity(problem, surface, state, error)
     damping = jnp.minimum(DAMPING + shift, 1.0) if method.finds_feet else 1.0
     damping = jnp.asarray(damping, error.dtype)
-    matrix = normal_equations(problem, surface.pieces, *feet, condition.weight, damping).matrix
+    weighted = *feet, condition.weight
+    rows = rows_with_influence(surface.pieces, *weighted)
+    matrix = normal_equations(problem, surface.pieces, rows, *weighted, damping).matrix
     fixed = matrix.at_fixed_parameters(damping)
     between = fixed.times(jnp.sqrt(damping))  # as in a step of the fit
     if condition.penalty is not None:

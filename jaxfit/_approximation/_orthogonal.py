@@ -21,7 +21,7 @@ from jaxfit._approximation._damping import (
     longest_moves,
     next_damping,
 )
-from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._approximation._distance_rows import normal_equations, rows_with_influence
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
@@ -277,12 +277,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
         if guard is not None:
             held = held | (guard.held > 0)
         always = problem.diagonal > 0
+        pieces = surface.pieces
         feet = (here.u, here.v, weight)
-        equations = materialise(
-            always,
-            lambda net, *x: normal_equations(problem, pieces_on(net, *axes), *x),
-            *(net, *feet, damping),
-        )
+        here_in_rows = (rows_with_influence(pieces, *feet), *feet)
+        equations = materialise(always, partial(normal_equations, problem), pieces, *here_in_rows, damping)
         term = DataTerm.of(self.loss, length, problem, here.error)
         equations, term = problem.total((equations, term))
         if guard is None:
@@ -291,9 +289,9 @@ class OrthogonalDistance(AbstractIterativeMethod):
         else:
             penalty = self.smoothing.penalty(guard, surface, problem.diagonal, term)
 
-        def correction_rhs(net: Array, move: Array) -> Array:
-            pieces, moves = pieces_on(net, *axes), pieces_on(move, *axes)
-            own = materialise(always, partial(second_order_rhs, problem), pieces, moves, *feet)
+        def correction_rhs(move: Array) -> Array:
+            moves = pieces_on(move, *axes)
+            own = materialise(always, partial(second_order_rhs, problem), pieces, moves, *here_in_rows)
             return problem.total(own)
 
         def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:

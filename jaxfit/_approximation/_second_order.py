@@ -22,17 +22,15 @@ from jaxfit._cells import (
     Jet,
     Rows,
     cells_to_net,
+    evaluate_first_order,
     evaluate_jet,
     local_coordinates,
     over_blocks,
     row_coefficients,
     row_moments,
-    row_width,
-    rows_of,
 )
 from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
-from jaxfit._unrolling import without_influence
 
 LEAST_SHARE = 0.5  # the share of the first form that must be left in the Hessian
 
@@ -41,15 +39,16 @@ def second_order_rhs(
     problem: Any,
     pieces: Pieces,
     moves: Pieces,
+    rows: Rows,
     u: Float[Array, " points"],
     v: Float[Array, " points"],
     weight: Float[Array, " points"],
 ) -> Float[Array, "nu nv d"]:
     r"""$-\tfrac{1}{2} \sum_k w_k B_k^T \Pi_k r_k''$ for the move whose pieces are `moves`: the right side for
-    the correction of that move, as the residuals are for the move itself.
+    the correction of that move, as the residuals are for the move itself. `rows` hold the points at their
+    feet (u, v).
     """
     pieces, moves = jax.tree.map(jnp.asarray, (pieces, moves))
-    rows = rows_of(pieces, u, v, row_width(u.shape[0], pieces.cells), without_influence(weight))
     (order_u, order_v), d = pieces.order, problem.target.shape[0]
     always = problem.diagonal > 0
     values = jnp.concatenate([problem.target, jnp.stack([u, v, weight])])
@@ -74,9 +73,9 @@ def _second_derivative_at(
     s, t = local_coordinates(pieces, part.cell[:, None], u, v)
     jet = materialise(always, evaluate_jet, row_coefficients(pieces, part), s, t)
     coefficients = row_coefficients(moves, part)
-    value, value_s, value_t = materialise(always, lambda *x: evaluate_jet(*x)[:3], coefficients, s, t)
+    value, value_s, value_t = materialise(always, evaluate_first_order, coefficients, s, t)
     e = target - jet.value
-    free = FootTangents.at(pieces, u, v, e, jet)
+    free = FootTangents.at(pieces, u, v, e, jet.s, jet.t)
     along = free.coordinates(value)
     right = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
     slide, valid = _slide(free, e, jet, along, right)

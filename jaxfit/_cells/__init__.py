@@ -11,6 +11,7 @@ from jaxfit._cells._layout import take as take
 from jaxfit._cells._layout import values_at as values_at
 from jaxfit._cells._overlap import overlap_add as overlap_add
 from jaxfit._cells._polynomials import Jet as Jet
+from jaxfit._cells._polynomials import evaluate_first_order as evaluate_first_order
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
 from jaxfit._cells._polynomials import horner as horner

@@ -29,6 +29,13 @@ def evaluate_jet(
     return Jet(*_along_rows(coefficients, s, t, PARTIALS))
 
 
+def evaluate_first_order(
+    coefficients: Float[Array, "rows d K L"], s: Float[Array, "rows width"], t: Float[Array, "rows width"]
+) -> list[Float[Array, "d rows width"]]:
+    """Value, and its derivatives along s and t."""
+    return _along_rows(coefficients, s, t, PARTIALS[:3])
+
+
 def evaluate_values(
     coefficients: Float[Array, "rows d K L"], s: Float[Array, "rows width"], t: Float[Array, "rows width"]
 ) -> Float[Array, "d rows width"]:

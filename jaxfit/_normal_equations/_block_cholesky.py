@@ -137,24 +137,26 @@ def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
     return jnp.take(flat, place, axis=1, mode="clip")
 
 
-def substitute(factors: Factors, right: Float[Array, "nu nv c"]) -> Float[Array, "nu nv c"]:
-    """The solution with the factors, forward and backward; control points not free get their right side."""
-    if factors.transposed:
-        right = right.transpose(1, 0, 2)
+def substitute(factors: Factors, right: Float[Array, "c nu nv"]) -> Float[Array, "c nu nv"]:
+    """The solution with the factors, forward and backward, the channels first; control points not free get
+    their right side.
+    """
+    by_rows = (2, 0, 1) if factors.transposed else (1, 0, 2)
+    right = right.transpose(by_rows)
     reach = factors.below.shape[1]
-    count, channels = right.shape[1:]
+    channels, count = right.shape[1:]
 
     def forward(window: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         below, value = row
-        value = value - window[:count]
-        return jnp.pad(window[count:], ((0, count), (0, 0))) + below @ value, value
+        value = value - window[:, :count]
+        return jnp.pad(window[:, count:], ((0, 0), (0, count))) + value @ below.T, value
 
     def backward(later: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         inverse, below, value = row
-        value = inverse @ value - below.T @ later
-        return jnp.concatenate([value, later[: reach - count]]), value
+        value = value @ inverse - later @ below
+        return jnp.concatenate([value, later[:, : reach - count]], axis=1), value
 
-    none = as_varying(jnp.zeros((reach, channels), right.dtype), factors, right)
+    none = as_varying(jnp.zeros((channels, reach), right.dtype), factors, right)
     _, half = lax.scan(forward, none, (factors.below, right))
     _, whole = lax.scan(backward, none, (factors.inverse, factors.below, half), reverse=True)
-    return whole.transpose(1, 0, 2) if factors.transposed else whole
+    return whole.transpose(np.argsort(by_rows))

@@ -26,14 +26,18 @@ class CoupledPreconditioner(eqx.Module):
     """
 
     factors: Factors
-    roots: Float[Array, "nu nv d d"]  # S^(-1/2)
+    roots: Float[Array, "d d nu nv"]  # S^(-1/2)
 
     def __call__(self, right: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
         """Near the solution."""
+        return jnp.moveaxis(self.coordinates_first(jnp.moveaxis(right, 2, 0)), 0, 2)
+
+    def coordinates_first(self, right: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+        """The same for nets that have their coordinates first."""
         return self._rotated(substitute(self.factors, self._rotated(right)))
 
-    def _rotated(self, x: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
-        return jnp.sum(self.roots * x[:, :, None, :], axis=-1)
+    def _rotated(self, x: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+        return jnp.sum(self.roots * x[:, None], axis=0)
 
 
 def coupled_preconditioner(
@@ -47,7 +51,7 @@ def coupled_preconditioner(
         jnp.where(free[:, :, None, None], blocks, unit[None, None]), symmetrize_input=False
     )
     scaled = vectors * lax.rsqrt(jnp.maximum(values, LEAST_SHARE))[:, :, None, :]
-    roots = jnp.einsum("ijab,ijcb->ijac", scaled, vectors, precision="highest")
+    roots = jnp.einsum("ijab,ijcb->acij", scaled, vectors, precision="highest")
     return CoupledPreconditioner(factorise(uncoupled, free), roots)
 
 
@@ -60,13 +64,13 @@ def solve_coupled(
     max_steps: Any,
 ) -> CGSolution:
     """The solution on the free control points, 0 elsewhere, by conjugate gradients."""
-    inside = free[:, :, None]
+    product, nearby, inside = matrix.product(), preconditioner.coordinates_first, free[None]
 
     def masked(x: Array) -> Array:
-        return jnp.where(inside, matrix(x), 0.0)
+        return jnp.where(inside, product(x), 0.0)
 
-    right = jnp.where(inside, right, 0.0)
-    solution = conjugate_gradients(masked, right, preconditioner, rtol, max_steps, coupled=True)
+    right = jnp.where(inside, right.transpose(2, 0, 1), 0.0)
+    solution = conjugate_gradients(masked, right, nearby, rtol, max_steps, coupled=True)
     if unrolled():  # its transpose begins here, and needs a right-hand side that is masked as well
         solution = solution._replace(net=jnp.where(inside, solution.net, 0.0))
-    return solution
+    return solution._replace(net=solution.net.transpose(1, 2, 0))

@@ -5,6 +5,7 @@ each point, have the normal matrix $\sum_k N_i N_j N_{i'} N_{j'} \Pi_k$. Each en
 its own, so this is one stencil for every pair of coordinates, from the same moments.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxfit._normal_equations._normal_matrix import entries_of_moments
-from jaxfit._normal_equations._stencil import Stencil, shifted_products
+from jaxfit._normal_equations._stencil import ShiftedProducts, Stencil
 from jaxfit._splines._pieces import Axis, Numbers
 
 
@@ -52,8 +53,12 @@ class CoupledStencil(eqx.Module):
 
     def __call__(self, net: Float[Numbers, "nu nv d"]) -> Float[Array, "nu nv d"]:
         """The matrix times a net."""
-        coordinates = jnp.moveaxis(jnp.asarray(net), 2, 0)[:, None]
-        return jnp.moveaxis(shifted_products(self.entries, coordinates), 0, 2)
+        return jnp.moveaxis(self.product()(jnp.moveaxis(jnp.asarray(net), 2, 0)), 0, 2)
+
+    def product(self) -> Callable[[Float[Array, "d nu nv"]], Float[Array, "d nu nv"]]:
+        """The product with nets that have their coordinates first, to be taken many times."""
+        products = ShiftedProducts.of(self.entries)
+        return lambda net: products(net[:, None])
 
     def dense(self) -> Float[Array, "n n"]:
         """All entries, the coordinates running fastest; for small nets and for tests."""

@@ -88,7 +88,8 @@ class BlockCholesky(lx.AbstractLinearSolver):
     def compute(self, state: Factors, vector: Any, options: dict[str, Any]) -> Any:
         """The solution for one right-hand side, all its channels together."""
         del options
-        return substitute(state, vector), lx.RESULTS.successful, {"shift": state.shift}
+        solution = substitute(state, vector.transpose(2, 0, 1)).transpose(1, 2, 0)
+        return solution, lx.RESULTS.successful, {"shift": state.shift}
 
     def transpose(self, state: Factors, options: dict[str, Any]) -> Any:
         """The matrix is symmetric."""

@@ -6,6 +6,7 @@ data: sum_k w_k N_i N_i' (u_k) N_j N_j' (v_k) does not change where i and i' cha
 not. So of the (2K - 1) x (2L - 1) neighbours one quadrant is enough.
 """
 
+from operator import mul
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,6 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._splines._pieces import Numbers
-from jaxfit._varying import as_varying
 
 
 class Stencil(eqx.Module):
@@ -35,7 +35,7 @@ class Stencil(eqx.Module):
     def __call__(self, net: Float[Numbers, "nu nv c"]) -> Float[Array, "nu nv c"]:
         """The matrix times a net, every coordinate for itself."""
         channels = jnp.moveaxis(jnp.asarray(net), 2, 0)[None]
-        return jnp.moveaxis(shifted_products(self.entries[None, None], channels), 0, 2)
+        return jnp.moveaxis(ShiftedProducts.of(self.entries[None, None])(channels), 0, 2)
 
     def plus(self, other: "Stencil") -> "Stencil":
         """The sum of both."""
@@ -56,35 +56,70 @@ class Stencil(eqx.Module):
         return self(unit).reshape(nu * nv, nu * nv)
 
 
-def shifted_products(
-    entries: Float[Numbers, "p q K L nu nv"], x: Float[Array, "q r nu nv"]
-) -> Float[Array, "s nu nv"]:
-    r"""$\sum_q E_q x_q$ over all neighbours, with stencils $E_{pq}$; p or r is 1, and s the other.
+class ShiftedProducts(eqx.Module):
+    r"""$x \mapsto \sum_q E_q x_q$ over all neighbours, with stencils $E_{pq}$, to be applied many times.
 
-    One loop over the shifts (a, b) and over q. Written out it would be 49 products for bicubic splines, which
-    take half a second to compile and run hardly faster.
+    The rows of the net lie end to end with zeros between them, so that every neighbour is a fixed number of
+    places away, and a product with one shift is plain vector arithmetic.
     """
-    p, q, order_u, order_v, nu, nv = entries.shape
-    reach_u, reach_v = order_u - 1, order_v - 1
-    wide = jnp.pad(x, ((0, 0), (0, 0), (reach_u, reach_u), (reach_v, reach_v)))
-    entries = jnp.pad(entries, ((0, 0),) * 4 + ((reach_u, 0), (reach_v, 0)))
-    a, b, number = np.indices((2 * order_u - 1, 2 * order_v - 1, q), np.int32).reshape(3, -1)
-    shift_u, shift_v = a - reach_u, b - reach_v
-    # Entries of a neighbour before this control point are stored with the neighbour.
-    stored = (number, abs(shift_u), abs(shift_v), np.minimum(a, reach_u), np.minimum(b, reach_v))
-    zero = np.int32(0)
 
-    def part_of(array: Array, start: tuple[Any, ...], size: tuple[int, ...]) -> Array:
-        return lax.dynamic_slice(array, start, size, allow_negative_indices=False)
+    entries: Float[Array, "K L q p places"]
+    shape: tuple[int, int] = eqx.field(static=True)
 
-    def add(total: Array, at: Any) -> tuple[Array, None]:
-        place, a, b = at
-        entry = part_of(entries, (zero, *place), (p, 1, 1, 1, nu, nv))
-        neighbour = part_of(wide, (place[0], zero, a, b), (1, x.shape[1], nu, nv))
-        return total + lax.squeeze(entry, (1, 2, 3)) * lax.squeeze(neighbour, (0,)), None
+    @staticmethod
+    def of(entries: Float[Numbers, "p q K L nu nv"]) -> "ShiftedProducts":
+        """Of the stencils `entries[p, q]`."""
+        p, q, order_u, order_v, nu, nv = entries.shape
+        # Products go to both sides, and a shift by 0 counts twice.
+        once = [np.where(np.arange(order) == 0, 0.5, 1.0) for order in (order_u, order_v)]
+        share = (once[0][:, None] * once[1])[None, None, :, :, None, None].astype(entries.dtype)
+        lines = jnp.pad(entries * share, ((0, 0),) * 5 + ((0, order_v - 1),))
+        lines = lines.reshape(p, q, order_u, order_v, -1)
+        before = _reach(order_u, order_v, nv)
+        return ShiftedProducts(
+            jnp.pad(lines, ((0, 0),) * 4 + ((before, 0),)).transpose(2, 3, 1, 0, 4), (nu, nv)
+        )
 
-    none = jnp.zeros((max(p, x.shape[1]), nu, nv), jnp.result_type(entries, x))
-    return lax.scan(add, as_varying(none, entries, x), (stored, a, b))[0]
+    def __call__(self, x: Float[Array, "q r nu nv"]) -> Float[Array, "s nu nv"]:
+        """p or r is 1, and s the other.
+
+        One loop over the shifts (a, b) forward, each with its four signs. Written out it would be 49 products
+        for bicubic splines, which take half a second to compile. The products of a shift are stored rather
+        than added to a total: a kernel that reads what it writes does not use vector instructions.
+        """
+        order_u, order_v, q, p, _ = self.entries.shape
+        (nu, nv), count = self.shape, x.shape[1]
+        width, reach = nv + order_v - 1, _reach(order_u, order_v, nv)
+        places = nu * width
+        lines = jnp.pad(x, ((0, 0),) * 3 + ((0, order_v - 1),)).reshape(1, 1, q, count, places)
+        lines = jnp.pad(lines, ((0, 0),) * 4 + ((reach, reach),))
+        a, b = np.indices((order_u, order_v), np.int32).reshape(2, -1)
+        signs = [(sign_a, sign_b) for sign_a in (1, -1) for sign_b in (1, -1)]
+        # An entry is stored at the first of its two rows and the first of its two columns.
+        stored = [reach - (i < 0) * a * width - (j < 0) * b for i, j in signs]
+        neighbours = [reach + i * a * width + j * b for i, j in signs]
+        zero = np.int32(0)
+
+        def part_of(array: Array, start: tuple[Any, ...], size: tuple[int, ...]) -> list[Array]:
+            part = lax.dynamic_slice(array, start, size, allow_negative_indices=False)
+            return lax.split(part, (1,) * q, axis=2)
+
+        def products(_: None, at: Any) -> tuple[None, Array]:
+            a, b, stored, neighbours = at
+            total: Any = 0.0
+            for here, there in zip(stored, neighbours, strict=True):
+                entries = part_of(self.entries, (a, b, zero, zero, here), (1, 1, q, p, places))
+                near = part_of(lines, (zero, zero, zero, zero, there), (1, 1, q, count, places))
+                total = sum(map(mul, entries, near), total)
+            return None, total
+
+        _, found = lax.scan(products, None, (a, b, stored, neighbours))
+        return jnp.sum(found, 0).reshape(-1, nu, width)[:, :, :nv]
+
+
+def _reach(order_u: int, order_v: int, nv: int) -> int:
+    """How many places away the farthest neighbour is."""
+    return (order_u - 1) * (nv + order_v - 1) + order_v - 1
 
 
 def shifted_slices(x: Any, count: int, size: int, axis: int) -> Any:
