@@ -6,7 +6,6 @@ data: sum_k w_k N_i N_i' (u_k) N_j N_j' (v_k) does not change where i and i' cha
 not. So of the (2K - 1) x (2L - 1) neighbours one quadrant is enough.
 """
 
-from operator import mul
 from typing import Any
 
 import equinox as eqx
@@ -91,8 +90,8 @@ class ShiftedProducts(eqx.Module):
         (nu, nv), count = self.shape, x.shape[1]
         width, reach = nv + order_v - 1, _reach(order_u, order_v, nv)
         places = nu * width
-        lines = jnp.pad(x, ((0, 0),) * 3 + ((0, order_v - 1),)).reshape(1, 1, q, count, places)
-        lines = jnp.pad(lines, ((0, 0),) * 4 + ((reach, reach),))
+        lines = jnp.pad(x, ((0, 0),) * 3 + ((0, order_v - 1),)).reshape(q, count, places)
+        lines = jnp.pad(lines, ((0, 0), (0, 0), (reach, reach)))
         a, b = np.indices((order_u, order_v), np.int32).reshape(2, -1)
         signs = [(sign_a, sign_b) for sign_a in (1, -1) for sign_b in (1, -1)]
         # An entry is stored at the first of its two rows and the first of its two columns.
@@ -100,17 +99,21 @@ class ShiftedProducts(eqx.Module):
         neighbours = [reach + i * a * width + j * b for i, j in signs]
         zero = np.int32(0)
 
-        def part_of(array: Array, start: tuple[Any, ...], size: tuple[int, ...]) -> list[Array]:
-            part = lax.dynamic_slice(array, start, size, allow_negative_indices=False)
-            return lax.split(part, (1,) * q, axis=2)
+        def part_of(array: Array, start: tuple[Any, ...], channels: int) -> Array:
+            before = range(array.ndim - 2)
+            size = (*(1 for _ in before), channels, places)
+            part = lax.dynamic_slice(
+                array, (*start[:-1], zero, start[-1]), size, allow_negative_indices=False
+            )
+            return lax.squeeze(part, before)
 
         def products(_: None, at: Any) -> tuple[None, Array]:
             a, b, stored, neighbours = at
             total: Any = 0.0
             for here, there in zip(stored, neighbours, strict=True):
-                entries = part_of(self.entries, (a, b, zero, zero, here), (1, 1, q, p, places))
-                near = part_of(lines, (zero, zero, zero, zero, there), (1, 1, q, count, places))
-                total = sum(map(mul, entries, near), total)
+                for number in map(np.int32, range(q)):
+                    entries = part_of(self.entries, (a, b, number, here), p)
+                    total += entries * part_of(lines, (number, there), count)
             return None, total
 
         _, found = lax.scan(products, None, (a, b, stored, neighbours))
