@@ -29,14 +29,14 @@ ROUNDING = (1e3, 1e5)  # the least of either in units of rounding, for single pr
 
 
 class Factors(eqx.Module):
-    """By rows of the net: `inverse[i]` of block D of row i, and `below[i]`, the K - 1 blocks of X after it.
+    """By rows of the net: `inverse_and_below[i]` is the inverse of block D of row i, and below it the K - 1
+    blocks of X after it, with the other sign.
 
     `shift` is the share of the diagonal that had to be added: 0 unless the matrix is nearly singular.
     Where `transposed`, the directions of the net are exchanged.
     """
 
-    inverse: Float[Array, "rows n n"]
-    below: Float[Array, "rows m n"]
+    inverse_and_below: Float[Array, "rows m n"]
     shift: Float[Array, ""]
     transposed: bool = eqx.field(static=True)
 
@@ -54,10 +54,9 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
     eps = float(jnp.finfo(entries.dtype).eps)
     smallest, added = max(LEAST_PIVOT, ROUNDING[0] * eps), max(SHIFT, ROUNDING[1] * eps)
     nu, nv = free.shape
-    reach = (entries.shape[0] - 1) * nv
 
     def failed(carry: tuple[Any, Array, Array]) -> Array:
-        (_, _, least), _, trials = carry
+        (_, least), _, trials = carry
         return ~(least > smallest) & (trials < 2)
 
     def attempt(carry: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
@@ -66,13 +65,13 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
         return _factors(entries, free, shift), shift, trials + 1
 
     zero = jnp.zeros((), entries.dtype)
-    blocks = (jnp.zeros((nu, nv, nv), entries.dtype), jnp.zeros((nu, reach, nv), entries.dtype), zero)
+    blocks = (jnp.zeros((nu, entries.shape[0] * nv, nv), entries.dtype), zero)
     begin = as_varying((blocks, zero, jnp.asarray(0, jnp.int32)), entries, free)
-    (inverse, below, _), shift, _ = lax.while_loop(failed, attempt, begin)
-    return Factors(inverse, below, shift, transposed)
+    (blocks, _), shift, _ = lax.while_loop(failed, attempt, begin)
+    return Factors(blocks, shift, transposed)
 
 
-def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, Array]:
+def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
     """Blocks of the factors, and the least pivot as a share of its diagonal entry."""
     order, _, nu, nv = entries.shape
     reach = (order - 1) * nv
@@ -92,7 +91,7 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, A
         after = [below[j * nv :] @ rest[j * nv : (j + 1) * nv].T for j in range(order - 1)]
         kept = [_with_row_below(x) for x in window[1:]]
         after = [x + y for x, y in zip(kept, after, strict=False)] + after[order - 2 :]
-        return after, (inverse, below, least)
+        return after, (jnp.concatenate([inverse, -below]), least)
 
     def _with_row_below(x: Array) -> Array:
         return jnp.pad(x, ((0, nv), (0, 0)))
@@ -100,8 +99,8 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array, A
     rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(2, 0, 1, 3))
     # What is taken off the rows to come: by columns of blocks, from the diagonal down.
     window = [jnp.zeros((reach - j * nv, nv), entries.dtype) for j in range(order - 1)]
-    _, (inverse, below, least) = lax.scan(step, as_varying(window, entries, free, shift), rows)
-    return inverse, below, jnp.min(least)
+    _, (blocks, least) = lax.scan(step, as_varying(window, entries, free, shift), rows)
+    return blocks, jnp.min(least)
 
 
 def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Array, Array]:
@@ -143,20 +142,20 @@ def substitute(factors: Factors, right: Float[Array, "c nu nv"]) -> Float[Array,
     """
     by_rows = (2, 0, 1) if factors.transposed else (1, 0, 2)
     right = right.transpose(by_rows)
-    reach = factors.below.shape[1]
     channels, count = right.shape[1:]
+    reach = factors.inverse_and_below.shape[1] - count
 
     def forward(window: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
-        below, value = row
-        value = value - window[:, :count]
-        return jnp.pad(window[:, count:], ((0, 0), (0, count))) + value @ below.T, value
+        blocks, value = row
+        value = value + window[:, :count]
+        return jnp.pad(window[:, count:], ((0, 0), (0, count))) + value @ blocks[count:].T, value
 
-    def backward(later: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        inverse, below, value = row
-        value = value @ inverse - later @ below
+    def backward(later: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        blocks, value = row
+        value = jnp.concatenate([value, later], axis=1) @ blocks
         return jnp.concatenate([value, later[:, : reach - count]], axis=1), value
 
     none = as_varying(jnp.zeros((channels, reach), right.dtype), factors, right)
-    _, half = lax.scan(forward, none, (factors.below, right))
-    _, whole = lax.scan(backward, none, (factors.inverse, factors.below, half), reverse=True)
+    _, half = lax.scan(forward, none, (factors.inverse_and_below, right))
+    _, whole = lax.scan(backward, none, (factors.inverse_and_below, half), reverse=True)
     return whole.transpose(np.argsort(by_rows))
