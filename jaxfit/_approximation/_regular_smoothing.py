@@ -1,5 +1,6 @@
 r"""`RegularSmoothing`: follows the errors, and is raised where a step would fold the surface."""
 
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -126,9 +127,7 @@ class RegularSmoothing(eqx.Module):
         xp: Any = np if is_concrete(self.first, self.least) else jnp
         factor, floor, zero = (xp.full(net.shape[:2], x, net.dtype) for x in (self.first, self.least, 0.0))
         folds = np.zeros((surface.axis_u.cells, surface.axis_v.cells), net.dtype)
-        knots = surface.knots_u, surface.knots_v
-        shapes = jax.eval_shape(lambda: Roughness.of(jnp.asarray(net), *knots, jnp.asarray(factor)))
-        nothing = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+        nothing = _no_roughness(*(_kind(x) for x in (net, surface.knots_u, surface.knots_v, factor)))
         return FoldGuard(factor, floor, zero, zero, folds), nothing
 
     def penalty(
@@ -203,3 +202,13 @@ class FoldGuard(eqx.Module):
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""
         return FoldGuard(self.factor, self.floor, self.holds, self.held, folds_by_cell(surface.pieces))
+
+
+def _kind(x: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(x.shape, jax.dtypes.canonicalize_dtype(x.dtype))
+
+
+@cache
+def _no_roughness(*kinds: jax.ShapeDtypeStruct) -> Roughness:
+    """Zeros in the place of what `Roughness.of` returns, which takes longer to find out than a small fit."""
+    return jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(Roughness.of, *kinds))
