@@ -225,6 +225,17 @@ def test_too_few_steps_are_reported(wavy):
     assert np.isfinite(feet.distance).all()
 
 
+def test_only_lost_feet_compile_the_search_on_borders():
+    surface = helpers.wavy_surface(9, 5)
+    points, start = np.random.default_rng(0).uniform(size=(40, 3)), (np.zeros(40), np.zeros(40))
+    searches = []
+    for steps in (100, 1, 1):
+        with helpers.count_compilations() as compiled:
+            closest_point(surface, points, start=start, max_steps=steps)
+        searches.append(compiled.names.count("jit(_run)"))
+    assert searches == [1, 1, 0]
+
+
 @pytest.mark.float32_too
 def test_feet_reach_the_working_precision():
     surface = helpers.wavy_surface(8, 8)
