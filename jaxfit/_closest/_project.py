@@ -62,22 +62,21 @@ def project(
     tolerance: Array,
     max_steps: Array,
     idle: Bool[Array, " points"] | None = None,
-    borders: bool | Bool[Array, ""] = True,
+    borders: bool = True,
     within: ParameterBounds | None = None,
 ) -> FootStates:
     """Foot points of `target` on the surface, from the starts (u, v); `idle` points stay where
-    they are. With `borders`, which may be traced, feet that do not converge are searched on the four
-    border curves (section 3.1 of the paper). With `within`, bounds for each foot, feet are searched
-    nowhere else.
+    they are. With `borders` feet that do not converge are searched on the four border curves (section 3.1 of
+    the paper). With `within`, bounds for each foot, feet are searched nowhere else.
 
     Centre the coordinates first: the rounding is estimated from their largest magnitude.
     """
     pieces = in_precision_of(target, pieces)
     limits = FootLimits.of(tolerance, jnp.max(jnp.abs(target)), max_steps)
     feet, bounds = initial_feet(pieces, u, v, idle, within, FOUND)
-    if within is not None or borders is False:
+    if within is not None or not borders:
         return iterate_feet(method, pieces, target, feet, limits, bounds)[0]
-    return _in_stages(method, pieces, target, feet, limits, jnp.where(borders, WHOLE_AGAIN, WHOLE_DOMAIN))
+    return _in_stages(method, pieces, target, feet, limits)
 
 
 def _in_stages(
@@ -86,16 +85,15 @@ def _in_stages(
     target: Array,
     feet: FootStates,
     limits: FootLimits,
-    last: Array,
 ) -> FootStates:
-    """Stages 0 to `last`: the whole domain, then one border after the other for feet that have not converged,
+    """All stages: the whole domain, then one border after the other for feet that have not converged,
     then the whole domain again, from the nearest points found. So converged feet are feet of the whole
     surface.
     """
 
     def unfinished(carry: tuple[Array, FootStates]) -> Array:
         number, feet = carry
-        return (number <= last) & jnp.any(~feet.converged)
+        return (number <= WHOLE_AGAIN) & jnp.any(~feet.converged)
 
     def stage(carry: tuple[Array, FootStates]) -> tuple[Array, FootStates]:
         number, old = carry

@@ -83,8 +83,8 @@ class ShiftedProducts(eqx.Module):
         """p or r is 1, and s the other.
 
         One loop over the shifts (a, b) forward, each with its four signs. Written out it would be 49 products
-        for bicubic splines, which take half a second to compile. The products of a shift are stored rather
-        than added to a total: a kernel that reads what it writes does not use vector instructions.
+        for bicubic splines, which take half a second to compile. Each step's sum is stored, and all are added
+        at the end: on a CPU a total carried along takes 1.2 times as long on large nets, twice on small ones.
         """
         order_u, order_v, q, p, _ = self.entries.shape
         (nu, nv), count = self.shape, x.shape[1]
