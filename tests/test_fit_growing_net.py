@@ -35,7 +35,7 @@ def without_programs(function):
     def another(*args):
         return function.__wrapped__(*args)
 
-    return compiled(another, static_argnums=0)
+    return compiled(another, **function._jit_options)
 
 
 @pytest.fixture(scope="module")
