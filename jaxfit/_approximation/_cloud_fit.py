@@ -70,7 +70,7 @@ def fit_cloud(
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
     if concrete and is_concrete(given):  # or else the method may have no derivative
         programs_ahead(method, problem, begun, cloud.shape[0], request, room)
-    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, room))
+    u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, method, room))
     order = order_by_cell(begun, u, v, cloud.shape[0], method.finds_feet)
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
@@ -104,10 +104,12 @@ def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
     doing(f"fitting {net[0]} x {net[1]} control points to {points} points")
 
 
-def _nearest(base: BSplineSurface, cloud: Any, room: Room | None) -> tuple[Any, Any]:
-    """The parameters of the closest points."""
-    if room is not None:
-        found = nearest_on(base, cloud, room=room)
+def _nearest(
+    base: BSplineSurface, cloud: Any, method: AbstractIterativeMethod, room: Room | None
+) -> tuple[Any, Any]:
+    """The parameters of the closest points; where the method moves to feet of its own, of most of them."""
+    if is_concrete(base, cloud):
+        found = nearest_on(base, cloud, room=room, certain=not method.finds_feet)
         return found["u"], found["v"]
     nearest = closest_point(base, cloud)
     return nearest.u, nearest.v

@@ -25,8 +25,10 @@ class Room(NamedTuple):
     chunk: int
 
 
-def nearest_on(surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None) -> Any:
-    """The nearest feet on the whole surface, all concrete; `known` ones as for `nearest_feet`."""
+def nearest_on(
+    surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None, certain: bool = True
+) -> Any:
+    """The nearest feet on the whole surface, all concrete; `known` and `certain` as for `nearest_feet`."""
     net, u, v = (np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v))
     whole = WorkingSurface.of(net, u, v)
     if room is not None:
@@ -37,6 +39,7 @@ def nearest_on(surface: BSplineSurface, points: Any, known: Any = None, room: Ro
         *whole.axes,
         np.asarray(points),
         known=known,
+        certain=certain,
         tolerance=default_foot_tolerance(net.dtype),
         max_steps=MAX_STEPS,
         used=net.shape[:2],

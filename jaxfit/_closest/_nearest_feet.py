@@ -36,6 +36,7 @@ def nearest_feet(
     *,
     start: tuple[Any, Any] | None = None,
     known: tuple[Any, Any, Any, Any] | None = None,
+    certain: bool = True,
     tolerance: float,
     max_steps: int,
     used: tuple[int, int] | None = None,
@@ -46,7 +47,8 @@ def nearest_feet(
     From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
-    then left out. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
+    then left out. If they need not be `certain`, the feet next to the nearest samples will do: of a thousand
+    points of a scan one or two have a nearer foot elsewhere. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
     repeated end knots, `used` says how many are in use along u and v.
     `chunk` is how many points are projected at a time; by default that depends on how many there are.
     """
@@ -56,7 +58,7 @@ def nearest_feet(
     if start is not None:
         best = projector(None, *start)
     else:
-        best = _globally(projector, known, used or net.shape[:2])
+        best = _globally(projector, known, used or net.shape[:2], certain)
     lost = np.flatnonzero(~best["converged"])
     if lost.size:
         best = {name: np.array(x) for name, x in best.items()}
@@ -147,7 +149,7 @@ class _Projector:
         return _run(self.method, borders, self.pieces, *inputs, idle, *self.limits)
 
 
-def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostFeet:
+def _globally(projector: _Projector, known: Any, used: tuple[int, int], certain: bool) -> HostFeet:
     """The nearest foot of all."""
     net = projector.net[: used[0], : used[1]]
     axes = [_in_use(axis, count) for axis, count in zip(projector.axes, used, strict=True)]
@@ -157,6 +159,8 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int]) -> HostF
         projector.compile_ahead()  # while SciPy's trees are imported and searched
         search = Search(sample(net.astype(projector.dtype), *axes))
         best = projector(None, *search.nearest(points))
+        if not certain:
+            return best
         best = {name: np.array(x) for name, x in best.items()}
         left = np.arange(len(points))
     else:
