@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
-from jaxfit._closest import _nearest_feet
+from jaxfit._closest import _chunks, _nearest_feet
 from jaxfit._splines._pieces import make_axis
 
 COUNT = 512  # one size for nearly all queries: few compilations
@@ -79,7 +79,7 @@ def test_a_cloud_in_chunks_has_the_feet_of_the_whole(wavy, monkeypatch):
     points, u, v = queries(wavy)
     start = (np.clip(u + 0.01, 0, 1), np.clip(v - 0.01, 0, 1))
     whole, warm = closest_point(wavy, points), closest_point(wavy, points, start)
-    monkeypatch.setattr(_nearest_feet, "CHUNK", COUNT // 2 - 50)  # three parts, the last one shorter
+    monkeypatch.setattr(_chunks, "CHUNK", COUNT // 2 - 50)  # three parts, the last one shorter
     for feet, expected in ((closest_point(wavy, points), whole), (closest_point(wavy, points, start), warm)):
         assert feet.converged.all()
         np.testing.assert_allclose(feet.distance, expected.distance, rtol=0, atol=1e-12)
@@ -180,6 +180,27 @@ def test_known_feet_give_way_to_nearer_ones(wavy):
     )
     assert feet["converged"].all()
     np.testing.assert_allclose(np.sqrt(feet["f"]), cold.distance, rtol=0, atol=1e-12)
+
+
+def test_feet_that_need_not_be_certain_are_searched_for_where_some_have_nearer_ones(wavy, monkeypatch):
+    points = np.random.default_rng(1).uniform(-0.2, 1.2, (8000, 3))
+    net = np.asarray(wavy.control_points)
+    axes = [make_axis(np.asarray(knots), 4) for knots in (wavy.knots_u, wavy.knots_v)]
+    searched, candidates = [], _nearest_feet.Search.candidates
+
+    def counted(search, points, *found):
+        searched[-1] += len(points)
+        return candidates(search, points, *found)
+
+    monkeypatch.setattr(_nearest_feet.Search, "candidates", counted)
+    squares = []
+    for certain in (True, False):
+        searched.append(0)
+        options = dict(certain=certain, tolerance=1e-12, max_steps=60)
+        squares.append(_nearest_feet.nearest_feet(Newton(), net, *axes, points, **options)["f"])
+    assert searched[1] < 0.8 * searched[0]
+    farther = squares[1] > squares[0] * (1 + 1e-6)
+    assert np.mean(farther) < 0.01
 
 
 def test_starts_near_the_feet_give_the_same_feet(wavy):

@@ -1,5 +1,7 @@
 """Smoothing that keeps a surface whole: no folds, exact where the points allow it, and no fit to noise."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -178,6 +180,48 @@ def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time
             np.testing.assert_array_equal(after.floor, smoothing.least)
         else:
             np.testing.assert_array_less(after.factor, 8.0)
+
+
+def test_the_first_fold_that_is_kept_out_ends_a_quick_way_down():
+    smoothing, order, yes, no = jf.RegularSmoothing(), (4, 4), jnp.array(True), jnp.array(False)
+    factor, nothing, whole = jnp.full((7, 6), 10.0), jnp.zeros((7, 6)), jnp.zeros((4, 3))
+    folded = whole.at[0, 0].set(1.0)
+    begun = FoldGuard(factor, jnp.full((7, 6), smoothing.least), nothing, nothing, whole)
+
+    def after(guard, folds, good):
+        new = dataclasses.replace(guard, folds=folds)
+        return smoothing.after(guard, new, yes, good, order, no)
+
+    np.testing.assert_allclose(after(begun, whole, yes).factor, 10.0 * smoothing.fall**2)
+    first = after(begun, folded, no)
+    far = np.asarray(first.held) == 0
+    assert 0 < far.sum() < far.size
+    np.testing.assert_allclose(np.asarray(first.factor)[far], smoothing.first)
+    np.testing.assert_allclose(np.asarray(first.factor)[~far], smoothing.raised * smoothing.first)
+    second = after(first, folded, no)
+    np.testing.assert_allclose(np.asarray(second.factor)[far], smoothing.first)
+    np.testing.assert_allclose(np.asarray(after(first, whole, yes).factor)[far], 100.0 * smoothing.fall)
+    begun_folded = dataclasses.replace(begun, folds=folded)
+    far = np.asarray(near_folds(folded, order)) == 0
+    np.testing.assert_allclose(
+        np.asarray(after(begun_folded, folded, yes).factor)[far], 10.0 * smoothing.fall
+    )
+
+
+def test_only_bases_that_are_near_and_whole_begin_with_less():
+    nothing, spacing = jnp.zeros((7, 6)), jnp.zeros((7, 6)).at[1:-1, 1:-1].set(0.2)
+    whole = FoldGuard(nothing, nothing, nothing, nothing, jnp.zeros((4, 3)))
+    folded = dataclasses.replace(whole, folds=whole.folds.at[0, 0].set(1.0))
+    cases = (
+        (whole, 0.0, 0.01),
+        (whole, 0.02, 0.1),
+        (whole, 0.049, 0.245),
+        (whole, 0.051, 1.0),
+        (folded, 0.02, 1.0),
+    )
+    for guard, error, share in cases:
+        np.testing.assert_allclose(guard.share_at_base(jnp.array(error), spacing), share, rtol=1e-6)
+    np.testing.assert_array_equal(whole.share_at_base(jnp.array(0.0), 0 * spacing), 1.0)
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
 def _nearest(
     base: BSplineSurface, cloud: Any, method: AbstractIterativeMethod, room: Room | None
 ) -> tuple[Any, Any]:
-    """The parameters of the closest points; where the method moves to feet of its own, of most of them."""
+    """The parameters of the closest points; nearly all are certain where the method finds feet of its own."""
     if is_concrete(base, cloud):
         found = nearest_on(base, cloud, room=room, certain=not method.finds_feet)
         return found["u"], found["v"]

@@ -105,12 +105,13 @@ class OrthogonalDistance(AbstractIterativeMethod):
     `RegularSmoothing` still fades everywhere there is none: the next step has another objective anyway.
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
-    the distance at the old parameters is at least the new one. The first step has mu = 1. After it mu
-    follows the ratio of the actual to the predicted reduction of F. A step is rejected if F, measured at
-    converged feet, has not fallen; so F never rises. It is also rejected if a foot has moved by several cells
-    and the reduction is less than predicted. A rejected step counts as an iteration, with the errors of the
-    surface before it. F is measured at local feet. With `RegularSmoothing` a step is also rejected if the
-    surface would fold where it did not, and taken again with more smoothing there.
+    the distance at the old parameters is at least the new one. The first step has mu = 1, or less where
+    `RegularSmoothing` starts near the points. After it mu follows the ratio of the actual to the predicted
+    reduction of F. A step is rejected if F, measured at converged feet, has not fallen; so F never rises. It
+    is also rejected if a foot has moved by several cells and the reduction is less than predicted. A rejected
+    step counts as an iteration, with the errors of the surface before it. F is measured at local feet. With
+    `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and taken again
+    with more smoothing there.
 
     Parameters
     ----------
@@ -255,7 +256,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
         following = jnp.where(better & ~good, damped.damping, following)
-        following = jnp.where(new.step == 1, self.damping, following)
+        following = jnp.where((new.step == 1) & better, self.damping, following)
         assert before.summary is not None
         assert here.summary is not None
         summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])
@@ -274,7 +275,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
         length = loss_length(self.loss, problem, here.error)
         weight = reweighted(self.loss, length, problem.weight, here.error)
         held = held_points(self.border, net.shape, surface.used)
+        longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
         if guard is not None:
+            assert here.summary is not None
+            error, spacing = here.summary[0] * problem.diagonal, jnp.where(held, 0.0, longest / self.reach)
+            share = jnp.where(iterate.step > 0, 1.0, guard.share_at_base(error, spacing))
+            guard, damping = self.smoothing.lowered(guard, share), share * damping
             held = held | (guard.held > 0)
         always = problem.diagonal > 0
         pieces = surface.pieces
@@ -297,7 +303,6 @@ class OrthogonalDistance(AbstractIterativeMethod):
         def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
             return gauss_newton_step(penalty, correction_rhs, *x)
 
-        longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
         second_order = damping < 1
         if guard is not None:
             second_order &= self.smoothing.has_faded(guard)

@@ -22,6 +22,8 @@ from jaxfit._normal_equations import Roughness
 # be met exactly the last digits would come slowly.
 FINE = 3e-5
 LONGEST_HOLD = 3.0  # accepted steps for which control points stay, around folds that come again and again
+NEAR = 0.25  # of the spacing of the net: steps from there are seldom longer than they may be
+LEAST_SHARE = 0.01
 FAR = 4.0  # times the average error, where folds have been kept out: out of reach
 STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
@@ -56,12 +58,16 @@ class RegularSmoothing(eqx.Module):
     The factors $c_{ij}$ fall from `first` to `least` from step to step. A step after which the surface would
     have more folds than before is rejected; the control points around the new ones stay where they are for
     the next one to three accepted steps, and their factors are raised and fall again more slowly. So a
-    surface without folds remains so on the samples: 8 in each direction of a cell, whose normals
-    may turn by 60 degrees from one to the next. Points that ask for a fold remain far away. A part of the
-    surface that folds were kept out of may be caught: too far from its points to follow them with the
-    smoothing that their distances cause. So after 25 iterations, if folds were kept out anywhere and the fit
-    may take 40, all factors rise once more, to half of `first`, and what has been raised around folds is
-    forgotten.
+    surface without folds remains so on the samples: 8 in each direction of a cell, whose normals may turn by
+    60 degrees from one to the next. Points that ask for a fold remain far away. A part of the surface that
+    folds were kept out of may be caught: too far from its points to follow them with the smoothing that their
+    distances cause. So after 25 iterations, if folds were kept out anywhere and the fit may take 40, all
+    factors rise once more, to half of `first`, and what has been raised around folds is forgotten.
+
+    A base surface without folds saves most of that way. If its distance from the points is, on average, less
+    than a quarter of that between its free control points, it begins with the share of `first`, and of the
+    damping, that the one distance is of the other. Its factors fall by `fall` squared. The first step that
+    would fold it ends that: all factors rise to `first`, and the fit goes on as from any other base.
 
     Parameters
     ----------
@@ -69,7 +75,7 @@ class RegularSmoothing(eqx.Module):
         The factor where nothing folds (default 3): a bend of 0.58 radian between two control points counts
         as one point at the usual distance.
     first : float
-        The factor of the first step (default 100).
+        The factor of the first step from a base surface far from the points (default 100).
     fall : float
         The factor of the next step over that of an accepted one, between 0 and 1 (default 0.7).
     raised : float
@@ -87,8 +93,9 @@ class RegularSmoothing(eqx.Module):
     On scans of faces and terrain, with tolerances out of reach, average errors are less than those of a thin
     plate of weight 5e-6 against the sum over the points, and there are no folds. Where a surface is far
     smoother than its net, a coarser net or a greater `least` is better. `first` matters: the large shape has
-    to settle before detail is followed. Smoothing once more took average errors of six fits of a head (nets
-    of 30 x 30 to 50 x 50, some points left out) to 0.67 times what they are without.
+    to settle before detail is followed, which near bases show already. Smoothing once more took average
+    errors of six fits of a head (nets of 30 x 30 to 50 x 50, some points left out) to 0.67 times what they
+    are without.
 
     Source: this library's own. The thin plate that it departs from is equation (10) of Kineri, Wang, Lin and
     Maekawa (2012).
@@ -150,7 +157,10 @@ class RegularSmoothing(eqx.Module):
         factor, floor, holds, held = jax.tree.map(jnp.asarray, (new.factor, new.floor, new.holds, new.held))
         floor = lax.select(fresh, jnp.minimum(jnp.maximum(RAISED_FLOOR * factor, floor), self.most), floor)
         floor = lax.select(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
-        factor = lax.select(good, jnp.maximum(self.fall * factor, floor), factor)
+        calm = ~jnp.any((holds > 0) | (jnp.max(jnp.asarray(old.folds)) > 0))
+        fall = jnp.where(calm, self.fall**2, self.fall)
+        factor = lax.select(good, jnp.maximum(fall * factor, floor), factor)
+        factor = jnp.where(jnp.any(fresh) & calm, jnp.maximum(factor, self.first), factor)
         factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
         again = late & jnp.any(floor > self.least)
@@ -159,6 +169,11 @@ class RegularSmoothing(eqx.Module):
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
         held = lax.select(fresh, holds, jnp.maximum(held - good, 0.0))
         return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))
+
+    def lowered(self, guard: "FoldGuard", share: Array) -> "FoldGuard":
+        """With this share of the factors, or `least`."""
+        factor = jnp.maximum(share * jnp.asarray(guard.factor), self.least)
+        return eqx.tree_at(lambda g: g.factor, guard, factor)
 
     def renewed(self, guard: "FoldGuard", surface: WorkingSurface) -> "FoldGuard":
         """For a surface whose new knots have moved the control points in the net."""
@@ -198,6 +213,14 @@ class FoldGuard(eqx.Module):
     holds: Float[Any, "nu nv"]
     held: Float[Any, "nu nv"]
     folds: Float[Any, "cells_u cells_v"]
+
+    def share_at_base(self, error: Array, spacing: Float[Array, "nu nv"]) -> Float[Array, ""]:
+        """The share of the usual smoothing and damping that the first step from a surface takes: its average
+        error over the average `spacing` of the control points that have any, if it is NEAR and has no folds.
+        """
+        whole, number = jnp.sum(spacing), jnp.sum(spacing > 0)
+        near = (error * number < NEAR * whole) & ~jnp.any(jnp.asarray(self.folds) > 0)
+        return jnp.where(near, jnp.maximum(error * number / jnp.where(near, whole, 1.0), LEAST_SHARE), 1.0)
 
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxfit._checks import eager_where_concrete
 from jaxfit._closest import Newton, nearest_feet
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
@@ -25,6 +26,7 @@ class Room(NamedTuple):
     chunk: int
 
 
+@eager_where_concrete
 def nearest_on(
     surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None, certain: bool = True
 ) -> Any:

@@ -1,5 +1,7 @@
 """Closest points on curves and surfaces."""
 
+from jaxfit._closest._chunks import HostFeet as HostFeet
+from jaxfit._closest._chunks import chunk_size as chunk_size
 from jaxfit._closest._closest_point import ClosestPoint as ClosestPoint
 from jaxfit._closest._closest_point import PointStatus as PointStatus
 from jaxfit._closest._closest_point import closest_point as closest_point
@@ -12,8 +14,6 @@ from jaxfit._closest._foot_update import update_feet as update_feet
 from jaxfit._closest._forms import dot as dot
 from jaxfit._closest._implicit import as_feet as as_feet
 from jaxfit._closest._iterate_feet import PointSums as PointSums
-from jaxfit._closest._nearest_feet import HostFeet as HostFeet
-from jaxfit._closest._nearest_feet import chunk_size as chunk_size
 from jaxfit._closest._nearest_feet import compile_search_ahead as compile_search_ahead
 from jaxfit._closest._nearest_feet import nearest_feet as nearest_feet
 from jaxfit._closest._project import ParameterBounds as ParameterBounds

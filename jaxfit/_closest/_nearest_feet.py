@@ -1,6 +1,5 @@
 """Nearest feet of concrete points: padded to common sizes; searched for above the reach of the surface."""
 
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Any
 
@@ -11,20 +10,27 @@ from jaxtyping import Float
 
 from jaxfit._cells import values_at
 from jaxfit._closest._candidates import Search
+from jaxfit._closest._chunks import (
+    CHUNK,
+    HostFeet,
+    chunk_size,
+    in_chunks,
+    neighbours_together,
+    padded,
+    places,
+)
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
 from jaxfit._closest._reach import Reach
 from jaxfit._closest._samples import sample
 from jaxfit._compile import compiled
-from jaxfit._cores import cores
-from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-CHUNK = 1 << 15  # points at a time: one program serves all clouds that have more
 MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
 # The reach costs about as much as the search for so many points a cell.
 LEAST_POINTS_PER_CELL = 24
-HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
+SOME = 4  # points in a cell show whether there are nearer feet elsewhere
+MUCH_NEARER = 0.999  # of a squared distance
 
 
 def nearest_feet(
@@ -47,9 +53,9 @@ def nearest_feet(
     From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
-    then left out. If they need not be `certain`, the feet next to the nearest samples will do: of a thousand
-    points of a scan one or two have a nearer foot elsewhere. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
-    repeated end knots, `used` says how many are in use along u and v.
+    then left out. For feet that need not be `certain`, only some of the points in large clouds are searched
+    for, and others where one of these has found a nearer foot. `tolerance` is a fraction of the extent. Of a
+    net with surplus control points, behind repeated end knots, `used` says how many are in use along u and v.
     `chunk` is how many points are projected at a time; by default that depends on how many there are.
     """
     if chunk is None:
@@ -140,7 +146,7 @@ class _Projector:
         one = partial(self._feet_of_chunk, borders)
         u, v = np.asarray(u), np.asarray(v)
         # A chunk of neighbours has fuller rows and stays in fewer cells.
-        order = neighbours_together(*self.axes, u, v) if u.size > self.size else None
+        order = neighbours_together(self.axes, u, v) if u.size > self.size else None
         return in_chunks(one, (chosen, u, v), self.size, order)
 
     def _feet_of_chunk(self, borders: bool, *inputs: np.ndarray) -> dict[str, Array]:
@@ -159,8 +165,6 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], certain:
         projector.compile_ahead()  # while SciPy's trees are imported and searched
         search = Search(sample(net.astype(projector.dtype), *axes))
         best = projector(None, *search.nearest(points))
-        if not certain:
-            return best
         best = {name: np.array(x) for name, x in best.items()}
         left = np.arange(len(points))
     else:
@@ -179,13 +183,39 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], certain:
         left = np.flatnonzero(~(below & best["converged"]))
     if left.size:
         search = search or Search(sample(net.astype(projector.dtype), *axes))
-        _try_candidates(projector, search, left, best)
+        if not certain:
+            left = _where_some_are_nearer(projector, search, left, best)
+        if left.size:
+            _try_candidates(projector, search, left, best)
     return best
+
+
+def _where_some_are_nearer(
+    projector: _Projector, search: Search, left: np.ndarray, best: HostFeet
+) -> np.ndarray:
+    """Search for some of the points `left`, and return the others of cells where that has found nearer feet,
+    and of the cells beside these. Where all are few none is searched for here, and all are returned.
+    """
+    axes, counts = projector.axes, (projector.axes[0].cells, projector.axes[1].cells)
+    every = left.size // (SOME * counts[0] * counts[1])
+    if every < 2:
+        return left
+    place = places(axes, counts, best["u"][left], best["v"][left])
+    some = np.argsort(place, kind="stable")[::every]
+    limit = MUCH_NEARER * best["f"][left[some]]
+    _try_candidates(projector, search, left[some], best)
+    wide = np.zeros((counts[0] + 2, counts[1] + 2), bool)
+    row, column = np.divmod(place[some[best["f"][left[some]] < limit]], counts[1])
+    for i, j in np.ndindex(3, 3):
+        wide[row + i, column + j] = True
+    chosen = wide[1:-1, 1:-1].reshape(-1)[place]
+    chosen[some] = False
+    return left[chosen]
 
 
 def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, best: HostFeet) -> None:
     """Start from every sample that may lead to a nearer foot of the points `left`."""
-    left = left[neighbours_together(*projector.axes, best["u"][left], best["v"][left])]  # quicker in the tree
+    left = left[neighbours_together(projector.axes, best["u"][left], best["v"][left])]  # quicker in the tree
     distance = np.sqrt(best["f"][left].astype(np.float64))
     points = np.ascontiguousarray(projector.centred.T[left])
     candidates = search.candidates(points, best["u"][left], best["v"][left], distance)
@@ -224,55 +254,6 @@ def _in_use(axis: Axis, count: int) -> Axis:
     )
 
 
-def chunk_size(count: int) -> int:
-    """The padded size that clouds are cut into: chunks keep a CPU's cores busy and memory in its caches."""
-    return CHUNK if jax.default_backend() == "cpu" and count > CHUNK else bucket(count)
-
-
-def in_chunks(
-    function: Any, arrays: tuple[np.ndarray, ...], size: int, order: np.ndarray | None = None
-) -> HostFeet:
-    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core;
-    the results are put together. The parts are cut from the entries in this `order`.
-    """
-    count = arrays[0].shape[-1]
-    number, threads = -(-count // size), cores()
-    if number > 1:  # as many for every thread
-        number = -(-number // threads) * threads
-    step = -(-count // number)
-    parts = [slice(begin, min(begin + step, count)) for begin in range(0, count, step)]
-    whole: HostFeet = {}
-
-    def one(part: slice) -> HostFeet:
-        cut = (x[..., part] if order is None else x.take(order[part], axis=-1) for x in arrays)
-        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in function(*cut).items()}
-
-    if len(parts) == 1:
-        return one(parts[0])
-    with ThreadPoolExecutor(min(len(parts), threads)) as pool:
-        pieces = list(pool.map(one, parts))
-    whole = {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
-    if order is None:
-        return whole
-    back = np.empty_like(order)
-    back[order] = np.arange(count)
-    return {name: x.take(back, axis=-1) for name, x in whole.items()}
-
-
-def neighbours_together(axis_u: Axis, axis_v: Axis, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The order of points in which those of one cell follow one another if knots are uniform, and nearly so
-    if they are not: places in a uniform grid of as many cells take a tenth of the time to find.
-    """
-    number = np.zeros(u.shape, np.int32)
-    for axis, x in ((axis_u, u), (axis_v, v)):
-        first, last = axis.breaks[0], axis.breaks[-1]
-        place = (x - first) * (axis.cells / (last - first))
-        number = number * axis.cells + np.clip(place, 0, axis.cells - 1).astype(np.int32)
-    if axis_u.cells * axis_v.cells < 1 << 16:  # which NumPy sorts in linear time
-        number = number.astype(np.uint16)
-    return np.argsort(number, kind="stable")
-
-
 def _middle(net: np.ndarray) -> np.ndarray:
     """Centre of the box around the net, about which coordinates carry the least rounding."""
     return 0.5 * (net.min(axis=(0, 1)) + net.max(axis=(0, 1)))
@@ -283,14 +264,6 @@ def _extent(net: np.ndarray, centred: np.ndarray) -> float:
     low = np.minimum(net.min(axis=(0, 1)), centred.min(axis=1))
     high = np.maximum(net.max(axis=(0, 1)), centred.max(axis=1))
     return float(np.linalg.norm(high - low))
-
-
-def padded(x: np.ndarray, size: int) -> np.ndarray:
-    """The last axis filled up to `size` with its last entry."""
-    filling = size - x.shape[-1]
-    if not filling:
-        return x
-    return np.concatenate([x, np.repeat(x[..., -1:], filling, axis=-1)], axis=-1)
 
 
 def take_nearer(best: HostFeet, which: np.ndarray, other: HostFeet) -> None:

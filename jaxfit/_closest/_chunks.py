@@ -1,0 +1,79 @@
+"""Points of a cloud in chunks of one size, cut so that neighbours come together, a thread for each core."""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxfit._cores import cores
+from jaxfit._precision import bucket
+from jaxfit._splines._pieces import Axis
+
+CHUNK = 1 << 15  # points at a time: one program serves all clouds that have more
+HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
+
+
+def chunk_size(count: int) -> int:
+    """The padded size that clouds are cut into: chunks keep a CPU's cores busy and memory in its caches."""
+    return CHUNK if jax.default_backend() == "cpu" and count > CHUNK else bucket(count)
+
+
+def in_chunks(
+    function: Any, arrays: tuple[np.ndarray, ...], size: int, order: np.ndarray | None = None
+) -> HostFeet:
+    """`function` of arrays cut along their last axis into parts of at most `size`, a thread for each core;
+    the results are put together. The parts are cut from the entries in this `order`.
+    """
+    count = arrays[0].shape[-1]
+    number, threads = -(-count // size), cores()
+    if number > 1:  # as many for every thread
+        number = -(-number // threads) * threads
+    step = -(-count // number)
+    parts = [slice(begin, min(begin + step, count)) for begin in range(0, count, step)]
+    whole: HostFeet = {}
+
+    def one(part: slice) -> HostFeet:
+        cut = (x[..., part] if order is None else x.take(order[part], axis=-1) for x in arrays)
+        return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in function(*cut).items()}
+
+    if len(parts) == 1:
+        return one(parts[0])
+    with ThreadPoolExecutor(min(len(parts), threads)) as pool:
+        pieces = list(pool.map(one, parts))
+    whole = {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
+    if order is None:
+        return whole
+    back = np.empty_like(order)
+    back[order] = np.arange(count)
+    return {name: x.take(back, axis=-1) for name, x in whole.items()}
+
+
+def neighbours_together(axes: tuple[Axis, Axis], u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The order of points in which those of one cell follow one another if knots are uniform, and nearly so
+    if they are not.
+    """
+    number = places(axes, (axes[0].cells, axes[1].cells), u, v)
+    if axes[0].cells * axes[1].cells < 1 << 16:  # which NumPy sorts in linear time
+        number = number.astype(np.uint16)
+    return np.argsort(number, kind="stable")
+
+
+def places(axes: tuple[Axis, Axis], counts: tuple[int, int], u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The rectangles of a uniform grid of the domain in which (u, v) lie, numbered row by row. These take a
+    tenth of the time to find that cells take.
+    """
+    number = np.zeros(u.shape, np.int32)
+    for axis, count, x in zip(axes, counts, (u, v), strict=True):
+        first, last = axis.breaks[0], axis.breaks[-1]
+        place = (x - first) * (count / (last - first))
+        number = number * count + np.clip(place, 0, count - 1).astype(np.int32)
+    return number
+
+
+def padded(x: np.ndarray, size: int) -> np.ndarray:
+    """The last axis filled up to `size` with its last entry."""
+    filling = size - x.shape[-1]
+    if not filling:
+        return x
+    return np.concatenate([x, np.repeat(x[..., -1:], filling, axis=-1)], axis=-1)
