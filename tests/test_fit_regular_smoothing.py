@@ -174,7 +174,8 @@ def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time
     least, nothing = jnp.full((7, 6), smoothing.least), jnp.zeros((7, 6))
     for floor in (least, least.at[3, 3].set(8.0)):
         guard = FoldGuard(floor, floor, nothing, nothing, jnp.zeros((4, 3)))
-        after = smoothing.after(guard, guard, jnp.array(True), jnp.array(True), order, jnp.array(late))
+        yes, most = jnp.array(True), 40 if late else 39
+        after = smoothing.after(guard, guard, yes, yes, order, jnp.array(25), jnp.array(most))
         if late and floor is not least:
             np.testing.assert_array_equal(after.factor, 0.5 * smoothing.first)
             np.testing.assert_array_equal(after.floor, smoothing.least)
@@ -188,9 +189,9 @@ def test_the_first_fold_that_is_kept_out_ends_a_quick_way_down():
     folded = whole.at[0, 0].set(1.0)
     begun = FoldGuard(factor, jnp.full((7, 6), smoothing.least), nothing, nothing, whole)
 
-    def after(guard, folds, good):
+    def after(guard, folds, good, step=3):
         new = dataclasses.replace(guard, folds=folds)
-        return smoothing.after(guard, new, yes, good, order, no)
+        return smoothing.after(guard, new, yes, good, order, jnp.array(step), jnp.array(40))
 
     np.testing.assert_allclose(after(begun, whole, yes).factor, 10.0 * smoothing.fall**2)
     first = after(begun, folded, no)
@@ -201,6 +202,8 @@ def test_the_first_fold_that_is_kept_out_ends_a_quick_way_down():
     second = after(first, folded, no)
     np.testing.assert_allclose(np.asarray(second.factor)[far], smoothing.first)
     np.testing.assert_allclose(np.asarray(after(first, whole, yes).factor)[far], 100.0 * smoothing.fall)
+    late = np.asarray(after(begun, folded, no, 26).factor)
+    np.testing.assert_allclose(late[far], 10.0)
     begun_folded = dataclasses.replace(begun, folds=folded)
     far = np.asarray(near_folds(folded, order)) == 0
     np.testing.assert_allclose(

@@ -26,8 +26,6 @@ from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._regular_smoothing import (
-    LEAST_STEPS,
-    RENEWED_AT,
     SETTLED_AT,
     FoldGuard,
     RegularSmoothing,
@@ -250,8 +248,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         guard = state.guard
         if guard is not None:
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
-            late = (new.step == RENEWED_AT) & (problem.tolerances.max_steps >= LEAST_STEPS)
-            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, late)
+            time = new.step, problem.tolerances.max_steps
+            guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, *time)
         # A step that folds is taken again with more smoothing there, not with more damping everywhere.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))

@@ -67,7 +67,8 @@ class RegularSmoothing(eqx.Module):
     A base surface without folds saves most of that way. If its distance from the points is, on average, less
     than a quarter of that between its free control points, it begins with the share of `first`, and of the
     damping, that the one distance is of the other. Its factors fall by `fall` squared. The first step that
-    would fold it ends that: all factors rise to `first`, and the fit goes on as from any other base.
+    would fold it ends that: all factors rise to `first`, or where that would not fade in time, to what they
+    had been without the haste.
 
     Parameters
     ----------
@@ -148,10 +149,19 @@ class RegularSmoothing(eqx.Module):
         return Roughness.of(net, *knots, rho * jnp.asarray(guard.factor))
 
     def after(
-        self, old: "FoldGuard", new: "FoldGuard", better: Array, good: Array, order: Any, late: Array
+        self,
+        old: "FoldGuard",
+        new: "FoldGuard",
+        better: Array,
+        good: Array,
+        order: Any,
+        step: Array,
+        max_steps: Array,
     ) -> "FoldGuard":
-        """The factors after a step: `better` if its objective is lower, `good` if also accepted, `late` if it
-        is time to smooth once more."""
+        """The factors after a step: `better` if its objective is lower, `good` if also accepted. Its number,
+        and that of all, say whether there is time to smooth once more.
+        """
+        early = (step <= RENEWED_AT) & (max_steps >= LEAST_STEPS)
         fresh = near_folds(jnp.maximum(new.folds - old.folds, 0.0), order) & better & ~good
         kept = near_folds(jnp.minimum(new.folds, old.folds), order) & good
         factor, floor, holds, held = jax.tree.map(jnp.asarray, (new.factor, new.floor, new.holds, new.held))
@@ -160,10 +170,11 @@ class RegularSmoothing(eqx.Module):
         calm = ~jnp.any((holds > 0) | (jnp.max(jnp.asarray(old.folds)) > 0))
         fall = jnp.where(calm, self.fall**2, self.fall)
         factor = lax.select(good, jnp.maximum(fall * factor, floor), factor)
-        factor = jnp.where(jnp.any(fresh) & calm, jnp.maximum(factor, self.first), factor)
+        slow = self.first * jnp.where(early, 1.0, self.fall**step)
+        factor = jnp.where(jnp.any(fresh) & calm, jnp.maximum(factor, slow), factor)
         factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
-        again = late & jnp.any(floor > self.least)
+        again = early & (step == RENEWED_AT) & jnp.any(floor > self.least)
         factor = jnp.where(again, jnp.maximum(factor, RENEWED * self.first), factor)
         floor = jnp.where(again, self.least, floor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
