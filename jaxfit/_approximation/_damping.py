@@ -19,7 +19,7 @@ RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # The damping falls below its usual minimum only after steps that achieve the predicted reduction and remove
 # a good part of the objective. Convergence is then superlinear where all points can be met. Otherwise a lower
 # minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding.
-EXCELLENT, MUCH, LEAST_DAMPING = 0.9, .5, 1e-12
+EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 

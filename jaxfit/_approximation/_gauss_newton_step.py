@@ -16,9 +16,10 @@ from jaxfit._normal_equations import (
 )
 from jaxfit._unrolling import constant, root
 
-RESIDUAL = 1e-5  # of a step's linear system, where conjugate gradients stop
-# Or after so many: few, for far from the end an exact solution is no better. At small mu steps
+# Of a step's linear system, where conjugate gradients stop: so little that what they leave does not depend on
+# rounding. Or after so many: few, for far from the end an exact solution is no better. At small mu steps
 # achieve what they predict, and the last digits take many.
+RESIDUAL = 1e-9
 FEW_STEPS, MANY_STEPS = 32, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
@@ -49,6 +50,7 @@ def gauss_newton_step(
     between = data.times(jnp.sqrt(damping)).plus(stiffness)
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
+    residual = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
     most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
     def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
@@ -58,7 +60,7 @@ def gauss_newton_step(
             lambda: right,
             lambda: lax.cond(second_order, lambda: correction_rhs(move), lambda: jnp.zeros_like(net)),
         )
-        solution = solve_coupled(matrix, rhs, free, preconditioner, RESIDUAL, most).net
+        solution = solve_coupled(matrix, rhs, free, preconditioner, residual, most).net
         limited = jnp.where(damped, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 

@@ -155,8 +155,8 @@ class RegularSmoothing(eqx.Module):
         better: Array,
         good: Array,
         order: Any,
-        step: Array,
-        max_steps: Array,
+        step: Any,
+        max_steps: Any,
     ) -> "FoldGuard":
         """The factors after a step: `better` if its objective is lower, `good` if also accepted. Its number,
         and that of all, say whether there is time to smooth once more.
@@ -178,7 +178,8 @@ class RegularSmoothing(eqx.Module):
         factor = jnp.where(again, jnp.maximum(factor, RENEWED * self.first), factor)
         floor = jnp.where(again, self.least, floor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
-        held = lax.select(fresh, holds, jnp.maximum(held - good, 0.0))
+        # Where all are held no step is better, and none would be accepted.
+        held = lax.select(fresh, holds, jnp.maximum(held - (good | ~better), 0.0))
         return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))
 
     def lowered(self, guard: "FoldGuard", share: Array) -> "FoldGuard":
