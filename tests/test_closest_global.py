@@ -182,7 +182,7 @@ def test_known_feet_give_way_to_nearer_ones(wavy):
     np.testing.assert_allclose(np.sqrt(feet["f"]), cold.distance, rtol=0, atol=1e-12)
 
 
-def test_feet_that_need_not_be_certain_are_searched_for_where_some_have_nearer_ones(wavy, monkeypatch):
+def test_a_search_that_is_not_thorough_finds_nearly_all_nearest_feet(wavy, monkeypatch):
     points = np.random.default_rng(1).uniform(-0.2, 1.2, (8000, 3))
     net = np.asarray(wavy.control_points)
     axes = [make_axis(np.asarray(knots), 4) for knots in (wavy.knots_u, wavy.knots_v)]
@@ -194,9 +194,9 @@ def test_feet_that_need_not_be_certain_are_searched_for_where_some_have_nearer_o
 
     monkeypatch.setattr(_nearest_feet.Search, "candidates", counted)
     squares = []
-    for certain in (True, False):
+    for thorough in (True, False):
         searched.append(0)
-        options = dict(certain=certain, tolerance=1e-12, max_steps=60)
+        options = dict(thorough=thorough, tolerance=1e-12, max_steps=60)
         squares.append(_nearest_feet.nearest_feet(Newton(), net, *axes, points, **options)["f"])
     assert searched[1] < 0.8 * searched[0]
     farther = squares[1] > squares[0] * (1 + 1e-6)

@@ -59,7 +59,9 @@ def approximate(
     weights : array (points,), optional
         The non-negative weight of each point (default 1). Errors are not weighted.
     start : pair of arrays (points,), optional
-        Feet (u, v) on the base surface to start from; default the closest points, searched globally.
+        Feet (u, v) on the base surface to start from; default the closest points, searched globally. Where a
+        cell has more than eight points and the method finds feet itself, some of them are searched for, and
+        the others where one of these has a nearer foot elsewhere than beside the nearest sample.
     progress : callable, optional
         Called as `progress(step, max_steps, average, maximum)` every now and then, outside transformations;
         errors are fractions of the diagonal.

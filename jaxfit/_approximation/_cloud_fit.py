@@ -107,9 +107,9 @@ def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
 def _nearest(
     base: BSplineSurface, cloud: Any, method: AbstractIterativeMethod, room: Room | None
 ) -> tuple[Any, Any]:
-    """The parameters of the closest points; nearly all are certain where the method finds feet of its own."""
+    """The parameters of the closest points. Methods that find feet themselves need no thorough search."""
     if is_concrete(base, cloud):
-        found = nearest_on(base, cloud, room=room, certain=not method.finds_feet)
+        found = nearest_on(base, cloud, room=room, thorough=not method.finds_feet)
         return found["u"], found["v"]
     nearest = closest_point(base, cloud)
     return nearest.u, nearest.v

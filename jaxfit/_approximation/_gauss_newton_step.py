@@ -16,9 +16,9 @@ from jaxfit._normal_equations import (
 )
 from jaxfit._unrolling import constant, root
 
-# Of a step's linear system, where conjugate gradients stop: so little that what they leave does not depend on
-# rounding. Or after so many: few, for far from the end an exact solution is no better. At small mu steps
-# achieve what they predict, and the last digits take many.
+# Conjugate gradients stop at this relative residual, which they reach where nets are small: there fits differ
+# little if sums are rounded otherwise. Or after so many steps: few, for far from the end an exact solution is
+# no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
 FEW_STEPS, MANY_STEPS = 32, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step

@@ -25,11 +25,7 @@ from jaxfit._approximation._distance_rows import normal_equations, rows_with_inf
 from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
-from jaxfit._approximation._regular_smoothing import (
-    SETTLED_AT,
-    FoldGuard,
-    RegularSmoothing,
-)
+from jaxfit._approximation._regular_smoothing import SETTLED_AT, FoldGuard, RegularSmoothing
 from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
     as_smoothing,
@@ -104,12 +100,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1, or less where
-    `RegularSmoothing` starts near the points. After it mu follows the ratio of the actual to the predicted
-    reduction of F. A step is rejected if F, measured at converged feet, has not fallen; so F never rises. It
-    is also rejected if a foot has moved by several cells and the reduction is less than predicted. A rejected
-    step counts as an iteration, with the errors of the surface before it. F is measured at local feet. With
-    `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and taken again
-    with more smoothing there.
+    `RegularSmoothing` begins at a base near the points. After it mu follows the ratio of the actual to the
+    predicted reduction of F. A step is rejected if F, measured at converged feet, has not fallen; so F never
+    rises. It is also rejected if a foot has moved by several cells and the reduction is less than predicted.
+    A rejected step counts as an iteration, with the errors of the surface before it. F is measured at local
+    feet. With `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and
+    taken again with more smoothing there.
 
     Parameters
     ----------
@@ -276,8 +272,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
         if guard is not None:
             assert here.summary is not None
-            error, spacing = here.summary[0] * problem.diagonal, jnp.where(held, 0.0, longest / self.reach)
-            share = jnp.where(iterate.step > 0, 1.0, guard.share_at_base(error, spacing))
+            spacing = jnp.sum(longest * ~held) / (self.reach * jnp.maximum(jnp.sum(~held), 1))
+            share = guard.share_at_base(iterate.step, here.summary[0] * problem.diagonal, spacing)
             guard, damping = self.smoothing.lowered(guard, share), share * damping
             held = held | (guard.held > 0)
         always = problem.diagonal > 0

@@ -22,8 +22,9 @@ from jaxfit._normal_equations import Roughness
 # be met exactly the last digits would come slowly.
 FINE = 3e-5
 LONGEST_HOLD = 3.0  # accepted steps for which control points stay, around folds that come again and again
-NEAR = 0.25  # of the spacing of the net: steps from there are seldom longer than they may be
-LEAST_SHARE = 0.01
+# A base whose average error is less than NEAR spacings of the net begins with less smoothing and damping, as
+# steps from there are seldom longer than control points may move; but with no less than LEAST_SHARE of them.
+NEAR, LEAST_SHARE = 0.25, 0.01
 FAR = 4.0  # times the average error, where folds have been kept out: out of reach
 STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
@@ -64,11 +65,12 @@ class RegularSmoothing(eqx.Module):
     distances cause. So after 25 iterations, if folds were kept out anywhere and the fit may take 40, all
     factors rise once more, to half of `first`, and what has been raised around folds is forgotten.
 
-    A base surface without folds saves most of that way. If its distance from the points is, on average, less
-    than a quarter of that between its free control points, it begins with the share of `first`, and of the
-    damping, that the one distance is of the other. Its factors fall by `fall` squared. The first step that
-    would fold it ends that: all factors rise to `first`, or where that would not fade in time, to what they
-    had been without the haste.
+    From a base surface without folds fewer steps are enough. Until a first fold has to be kept out, the
+    factors fall by `fall` squared. If the distance of the points from the base is on average less than a
+    quarter of the spacing of its free control points, the first factor is `first` times the ratio of the two,
+    and so is the first damping. When a first fold has to be kept out, all factors rise to `first`; or, after
+    25 iterations and in fits that may not take 40, to what falling by `fall` from the beginning would have
+    left.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ class RegularSmoothing(eqx.Module):
     On scans of faces and terrain, with tolerances out of reach, average errors are less than those of a thin
     plate of weight 5e-6 against the sum over the points, and there are no folds. Where a surface is far
     smoother than its net, a coarser net or a greater `least` is better. `first` matters: the large shape has
-    to settle before detail is followed, which near bases show already. Smoothing once more took average
+    to settle before detail is followed, as it has in a base near the points. Smoothing once more took average
     errors of six fits of a head (nets of 30 x 30 to 50 x 50, some points left out) to 0.67 times what they
     are without.
 
@@ -158,27 +160,26 @@ class RegularSmoothing(eqx.Module):
         step: Any,
         max_steps: Any,
     ) -> "FoldGuard":
-        """The factors after a step: `better` if its objective is lower, `good` if also accepted. Its number,
-        and that of all, say whether there is time to smooth once more.
+        """The factors after a step: `better` if its objective is lower, `good` if also accepted. Its number
+        and the largest one say whether all factors may still rise and fade again.
         """
-        early = (step <= RENEWED_AT) & (max_steps >= LEAST_STEPS)
+        in_time = (step <= RENEWED_AT) & (max_steps >= LEAST_STEPS)
         fresh = near_folds(jnp.maximum(new.folds - old.folds, 0.0), order) & better & ~good
         kept = near_folds(jnp.minimum(new.folds, old.folds), order) & good
         factor, floor, holds, held = jax.tree.map(jnp.asarray, (new.factor, new.floor, new.holds, new.held))
         floor = lax.select(fresh, jnp.minimum(jnp.maximum(RAISED_FLOOR * factor, floor), self.most), floor)
         floor = lax.select(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
-        calm = ~jnp.any((holds > 0) | (jnp.max(jnp.asarray(old.folds)) > 0))
-        fall = jnp.where(calm, self.fall**2, self.fall)
-        factor = lax.select(good, jnp.maximum(fall * factor, floor), factor)
-        slow = self.first * jnp.where(early, 1.0, self.fall**step)
-        factor = jnp.where(jnp.any(fresh) & calm, jnp.maximum(factor, slow), factor)
+        no_fold_yet = ~(jnp.any(holds > 0) | jnp.any(jnp.asarray(old.folds) > 0))
+        factor = lax.select(good, jnp.maximum(self.fall ** (1 + no_fold_yet) * factor, floor), factor)
+        usual = self.first * self.fall ** (step * ~in_time)
+        factor = jnp.where(jnp.any(fresh) & no_fold_yet, jnp.maximum(factor, usual), factor)
         factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
-        again = early & (step == RENEWED_AT) & jnp.any(floor > self.least)
+        again = in_time & (step == RENEWED_AT) & jnp.any(floor > self.least)
         factor = jnp.where(again, jnp.maximum(factor, RENEWED * self.first), factor)
         floor = jnp.where(again, self.least, floor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
-        # Where all are held no step is better, and none would be accepted.
+        # Also where no step is better, as none is while all are held.
         held = lax.select(fresh, holds, jnp.maximum(held - (good | ~better), 0.0))
         return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))
 
@@ -226,13 +227,12 @@ class FoldGuard(eqx.Module):
     held: Float[Any, "nu nv"]
     folds: Float[Any, "cells_u cells_v"]
 
-    def share_at_base(self, error: Array, spacing: Float[Array, "nu nv"]) -> Float[Array, ""]:
-        """The share of the usual smoothing and damping that the first step from a surface takes: its average
-        error over the average `spacing` of the control points that have any, if it is NEAR and has no folds.
+    def share_at_base(self, step: Any, error: Array, spacing: Array) -> Float[Array, ""]:
+        """The share of the usual smoothing and damping that a step takes: for the first one from a base that
+        is NEAR and has no folds the average error over the average `spacing` of the net, otherwise 1.
         """
-        whole, number = jnp.sum(spacing), jnp.sum(spacing > 0)
-        near = (error * number < NEAR * whole) & ~jnp.any(jnp.asarray(self.folds) > 0)
-        return jnp.where(near, jnp.maximum(error * number / jnp.where(near, whole, 1.0), LEAST_SHARE), 1.0)
+        near = (step == 0) & (error < NEAR * spacing) & ~jnp.any(jnp.asarray(self.folds) > 0)
+        return jnp.where(near, jnp.maximum(error / jnp.where(near, spacing, 1.0), LEAST_SHARE), 1.0)
 
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""

@@ -28,9 +28,9 @@ class Room(NamedTuple):
 
 @eager_where_concrete
 def nearest_on(
-    surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None, certain: bool = True
+    surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None, thorough: bool = True
 ) -> Any:
-    """The nearest feet on the whole surface, all concrete; `known` and `certain` as for `nearest_feet`."""
+    """The nearest feet on the whole surface, all concrete; `known` and `thorough` as for `nearest_feet`."""
     net, u, v = (np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v))
     whole = WorkingSurface.of(net, u, v)
     if room is not None:
@@ -41,7 +41,7 @@ def nearest_on(
         *whole.axes,
         np.asarray(points),
         known=known,
-        certain=certain,
+        thorough=thorough,
         tolerance=default_foot_tolerance(net.dtype),
         max_steps=MAX_STEPS,
         used=net.shape[:2],

@@ -42,7 +42,7 @@ def nearest_feet(
     *,
     start: tuple[Any, Any] | None = None,
     known: tuple[Any, Any, Any, Any] | None = None,
-    certain: bool = True,
+    thorough: bool = True,
     tolerance: float,
     max_steps: int,
     used: tuple[int, int] | None = None,
@@ -53,9 +53,9 @@ def nearest_feet(
     From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
-    then left out. For feet that need not be `certain`, only some of the points in large clouds are searched
-    for, and others where one of these has found a nearer foot. `tolerance` is a fraction of the extent. Of a
-    net with surplus control points, behind repeated end knots, `used` says how many are in use along u and v.
+    then left out. If the search is not `thorough`, in large clouds only some points of each cell are searched
+    for, and all where one of these has found a nearer foot. `tolerance` is a fraction of the extent. Of a net
+    with surplus control points, behind repeated end knots, `used` says how many are in use along u and v.
     `chunk` is how many points are projected at a time; by default that depends on how many there are.
     """
     if chunk is None:
@@ -64,7 +64,7 @@ def nearest_feet(
     if start is not None:
         best = projector(None, *start)
     else:
-        best = _globally(projector, known, used or net.shape[:2], certain)
+        best = _globally(projector, known, used or net.shape[:2], thorough)
     lost = np.flatnonzero(~best["converged"])
     if lost.size:
         best = {name: np.array(x) for name, x in best.items()}
@@ -155,7 +155,7 @@ class _Projector:
         return _run(self.method, borders, self.pieces, *inputs, idle, *self.limits)
 
 
-def _globally(projector: _Projector, known: Any, used: tuple[int, int], certain: bool) -> HostFeet:
+def _globally(projector: _Projector, known: Any, used: tuple[int, int], thorough: bool) -> HostFeet:
     """The nearest foot of all."""
     net = projector.net[: used[0], : used[1]]
     axes = [_in_use(axis, count) for axis, count in zip(projector.axes, used, strict=True)]
@@ -183,38 +183,40 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], certain:
         left = np.flatnonzero(~(below & best["converged"]))
     if left.size:
         search = search or Search(sample(net.astype(projector.dtype), *axes))
-        if not certain:
-            left = _where_some_are_nearer(projector, search, left, best)
-        if left.size:
-            _try_candidates(projector, search, left, best)
+        if not thorough:
+            left = _where_some_have_nearer_feet(projector, search, left, best)
+        _try_candidates(projector, search, left, best)
     return best
 
 
-def _where_some_are_nearer(
+def _where_some_have_nearer_feet(
     projector: _Projector, search: Search, left: np.ndarray, best: HostFeet
 ) -> np.ndarray:
-    """Search for some of the points `left`, and return the others of cells where that has found nearer feet,
-    and of the cells beside these. Where all are few none is searched for here, and all are returned.
+    """Search for SOME of the points `left` in each cell, and return the other points of cells where that has
+    found much nearer feet, and of the cells around these. Where points are few all are returned.
     """
-    axes, counts = projector.axes, (projector.axes[0].cells, projector.axes[1].cells)
-    every = left.size // (SOME * counts[0] * counts[1])
+    axes = projector.axes
+    cells = axes[0].cells, axes[1].cells
+    every = left.size // (SOME * cells[0] * cells[1])
     if every < 2:
         return left
-    place = places(axes, counts, best["u"][left], best["v"][left])
+    place = places(axes, best["u"][left], best["v"][left])
     some = np.argsort(place, kind="stable")[::every]
     limit = MUCH_NEARER * best["f"][left[some]]
     _try_candidates(projector, search, left[some], best)
-    wide = np.zeros((counts[0] + 2, counts[1] + 2), bool)
-    row, column = np.divmod(place[some[best["f"][left[some]] < limit]], counts[1])
+    row, column = np.divmod(place[some[best["f"][left[some]] < limit]], cells[1])
+    around = np.zeros((cells[0] + 2, cells[1] + 2), bool)
     for i, j in np.ndindex(3, 3):
-        wide[row + i, column + j] = True
-    chosen = wide[1:-1, 1:-1].reshape(-1)[place]
+        around[row + i, column + j] = True
+    chosen = around[1:-1, 1:-1].reshape(-1)[place]
     chosen[some] = False
     return left[chosen]
 
 
 def _try_candidates(projector: _Projector, search: Search, left: np.ndarray, best: HostFeet) -> None:
-    """Start from every sample that may lead to a nearer foot of the points `left`."""
+    """Start from every sample that may lead to a nearer foot of the points `left`, if there are any."""
+    if not left.size:
+        return
     left = left[neighbours_together(projector.axes, best["u"][left], best["v"][left])]  # quicker in the tree
     distance = np.sqrt(best["f"][left].astype(np.float64))
     points = np.ascontiguousarray(projector.centred.T[left])
