@@ -7,14 +7,13 @@ exceeds the foot's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv 
 only. Every sample this close that is not beside a foot already found is a start.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfit._closest._samples import Samples
-from jaxfit._cores import cores
+from jaxfit._cores import cores, on_all_cores
 
 WIDER = 1.5  # how much slack may differ among samples equally far from a point
 BESIDE = 1.5  # samples
@@ -74,8 +73,7 @@ class Search:
     ) -> "StartCandidates":
         """The samples that may lead to a foot nearer to the points than those at (u, v)."""
         parts = [slice(begin, begin + BLOCK) for begin in range(0, len(distance), BLOCK)]
-        with ThreadPoolExecutor(cores()) as pool:
-            found = list(pool.map(lambda part: self._candidates_of(part, points, u, v, distance), parts))
+        found = on_all_cores(lambda part: self._candidates_of(part, points, u, v, distance), parts)
         who, sample = (np.concatenate(x) for x in zip(*found, strict=True))
         return StartCandidates(self, points, who, sample)
 

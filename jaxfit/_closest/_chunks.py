@@ -1,12 +1,11 @@
 """Points of a cloud in chunks of one size, cut so that neighbours come together, a thread for each core."""
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxfit._cores import cores
+from jaxfit._cores import cores, on_all_cores
 from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis
 
@@ -36,10 +35,9 @@ def in_chunks(
         cut = (x[..., part] if order is None else x.take(order[part], axis=-1) for x in arrays)
         return {name: np.asarray(x)[..., : part.stop - part.start] for name, x in function(*cut).items()}
 
-    if len(parts) == 1:
-        return one(parts[0])
-    with ThreadPoolExecutor(min(len(parts), threads)) as pool:
-        pieces = list(pool.map(one, parts))
+    pieces = on_all_cores(one, parts)
+    if len(pieces) == 1:
+        return pieces[0]
     whole = {name: np.concatenate([piece[name] for piece in pieces], axis=-1) for name in pieces[0]}
     if order is None:
         return whole

@@ -6,22 +6,24 @@ Let p be a foot of q at the distance d, and p + x another point of the surface. 
     d > |x|^2 / (2 |x_n|),      x_n the normal part of x.
 
 The least of these over all x is the reach at p (Federer 1959): up to it no foot is any but the nearest. It
-is taken over pairs of neighbouring samples. Farther ones are at least a radius R away, which alone gives
-R / 2. What lies between samples is left to a factor of safety: this is an estimate, not a proof.
+is taken over pairs of neighbouring samples, and with half the radius of curvature at samples. Farther ones
+are at least a radius R away, which alone gives R / 2. What lies between samples is left to a factor of
+safety: this is an estimate, not a proof.
 """
 
-from concurrent.futures import ThreadPoolExecutor
+import math
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit._closest._samples import grid_jet
-from jaxfit._cores import cores
+from jaxfit._cores import on_all_cores
 from jaxfit._splines._pieces import Axis
 
-SAFETY = 0.3  # of the reach, which is sampled
-PER_CELL = 2  # samples in each direction
+SAFETY = 0.3  # of the reach between samples
+SHARE_OF_RADIUS = 0.5  # of the least radius of curvature, which is exact at samples
+LEAST_SAMPLES = 16  # intervals between samples along each direction; one a cell where there are more cells
 NEIGHBOURS = 33  # samples around one, itself included
 ADJACENT = 2  # samples so close along both parameters show the curvature
 # How far, in samples along each direction, two points of the surface may move against the samples beside.
@@ -42,14 +44,15 @@ class Reach:
         self.axes = axis_u, axis_v
         along = [_parameters(axis) for axis in self.axes]
         (u, cell_u), (v, cell_v) = along
-        jet: Any = grid_jet(net, self.axes, (u, v), (cell_u, cell_v), 1)
-        points, du, dv = (
-            np.ascontiguousarray(jet[:, i, j].transpose(1, 0, 2)) for i, j in ((0, 0), (1, 0), (0, 1))
-        )
-        du, dv = (2.0 / PER_CELL) * du, (2.0 / PER_CELL) * dv  # of a sample
-        self.shape = points.shape[1:]
-        self.diagonal = _diagonals(points).reshape(-1)
-        self.points, du, dv = (x.reshape(len(x), -1) for x in (points, du, dv))
+        jet: Any = grid_jet(net, self.axes, (u, v), (cell_u, cell_v), 2)
+        a, b = (2.0 / _samples_per_cell(axis) for axis in self.axes)  # derivatives of a sample
+
+        def derivative(i: int, j: int) -> np.ndarray:
+            return (a**i * b**j) * np.moveaxis(jet[:, i, j], 1, 0).reshape(net.shape[2], -1)
+
+        self.shape = u.size, v.size
+        self.points, du, dv = derivative(0, 0), derivative(1, 0), derivative(0, 1)
+        self.diagonal = _diagonals(self.points.reshape(-1, *self.shape)).reshape(-1)
         E, F, G = (_dot(x, y) for x, y in ((du, du), (du, dv), (dv, dv)))
         one = np.maximum(E * G - F * F, ROUNDING * E * G) + np.finfo(E.dtype).tiny
         self.normal = np.cross(du, dv, axis=0) / np.sqrt(one)
@@ -57,6 +60,10 @@ class Reach:
         # A vector is x = s du + t dv + x_n, with s = x . dual_u and t = x . dual_v.
         self.dual_u, self.dual_v = (G * du - F * dv) / one, (E * dv - F * du) / one
         self.forms = E, F, G
+        L, M, N = (_dot(derivative(*which), self.normal) for which in ((2, 0), (1, 1), (0, 2)))
+        mean, gauss = (E * N - 2 * F * M + G * L) / (2 * one), (L * N - M * M) / one
+        most_curved = np.abs(mean) + np.sqrt(np.maximum(mean * mean - gauss, 0))
+        self.half_radius = SHARE_OF_RADIUS / np.maximum(most_curved, np.finfo(E.dtype).tiny)
         self.tree = KDTree(self.points.T, LEAF, balanced_tree=False, compact_nodes=False)
 
     def exceeds(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
@@ -70,10 +77,8 @@ class Reach:
         asked[place] = True
         number = np.flatnonzero(_around(asked.reshape(a - 1, b - 1), np.logical_or, False))
         parts = [number[begin : begin + BLOCK] for begin in range(0, number.size, BLOCK)]
-        with ThreadPoolExecutor(cores()) as pool:
-            found = list(pool.map(self._reach_at, parts))
         reach = np.full(a * b, np.inf)
-        reach[number] = np.concatenate(found)
+        reach[number] = np.concatenate(on_all_cores(self._reach_at, parts))
         return distance <= _least_of_four(reach.reshape(a, b)).reshape(-1)[place]
 
     def _reach_at(self, number: np.ndarray) -> Float[np.ndarray, " samples"]:
@@ -81,7 +86,7 @@ class Reach:
         count = min(NEIGHBOURS, self.tree.n)
         away, beside = self.tree.query(self.points.T[number], count)
         away, beside = (np.ascontiguousarray(x.reshape(-1, count).T) for x in (away, beside))
-        x = [p[beside[1:]] - p[number] for p in self.points]
+        x = [p.take(beside[1:]) - p[number] for p in self.points]
         s, t = (_dot(x, dual[:, number]) for dual in (self.dual_u, self.dual_v))
         E, F, G = (form[number] for form in self.forms)
         normal = self.normal[:, number]
@@ -89,7 +94,7 @@ class Reach:
         close = self._are_close(number, beside[1:])
         # Points of other parts of the surface are not where their samples are: each of these may move.
         turned = MOVE * sum(
-            np.abs(_dot(tangent[:, beside[1:]], normal[:, None])) for tangent in self.tangents
+            np.abs(_dot([y.take(beside[1:]) for y in tangent], normal)) for tangent in self.tangents
         )
         s_left, t_left = (np.copysign(np.maximum(np.abs(y) - MOVE, 0), y) for y in (s, t))
         along2 = np.maximum(E * s_left**2 + 2 * F * s_left * t_left + G * t_left**2, 0)
@@ -103,7 +108,7 @@ class Reach:
             others = self.diagonal[beside[-OUTERMOST:]].max(axis=0)
             radius = away[-1] - 0.5 * (self.diagonal[number] + others)
             reach = np.minimum(reach, 0.5 * np.maximum(radius, 0) / SAFETY)
-        return SAFETY * reach
+        return np.minimum(SAFETY * reach, self.half_radius[number])
 
     def _are_close(self, number: np.ndarray, beside: np.ndarray) -> Bool[np.ndarray, "neighbours samples"]:
         """Whether at most ADJACENT samples apart along u and along v."""
@@ -125,11 +130,26 @@ class Reach:
         return np.sqrt(part)
 
 
+def number_of_samples(axis_u: Axis, axis_v: Axis) -> int:
+    """How many samples `Reach` takes, which is what it costs."""
+    return math.prod(_cells(axis) * _samples_per_cell(axis) + 1 for axis in (axis_u, axis_v))
+
+
+def _cells(axis: Axis) -> int:
+    first, last = axis.ends
+    return int(last) + 1 - int(first)
+
+
+def _samples_per_cell(axis: Axis) -> int:
+    return -(-LEAST_SAMPLES // _cells(axis))
+
+
 def _parameters(axis: Axis) -> tuple[Any, np.ndarray]:
     """Parameters of the samples and the cells they lie in; the last sample ends the last cell."""
     first, last = axis.ends
-    cell = np.append(np.repeat(np.arange(first, last + 1), PER_CELL), last)
-    share = np.append(np.tile(np.arange(PER_CELL) / PER_CELL, last + 1 - first), 1.0)
+    count = _samples_per_cell(axis)
+    cell = np.append(np.repeat(np.arange(first, last + 1), count), last)
+    share = np.append(np.tile(np.arange(count) / count, last + 1 - first), 1.0)
     return axis.centre[cell] + axis.half[cell] * (2.0 * share - 1.0), cell
 
 
@@ -137,7 +157,7 @@ def _interval(axis: Axis, x: np.ndarray, count: int) -> np.ndarray:
     """The number of the interval between samples, along one direction."""
     first, last = axis.ends
     knots = np.asarray(axis.breaks)[first : last + 2]
-    place = np.interp(x, knots, np.arange(knots.size, dtype=np.float64) * PER_CELL)
+    place = np.interp(x, knots, np.arange(knots.size, dtype=np.float64) * _samples_per_cell(axis))
     return np.minimum(place.astype(np.int32), count - 1)
 
 
