@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -21,6 +22,8 @@ from jaxfit._unrolling import constant, root
 # no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
 FEW_STEPS, MANY_STEPS = 32, 100
+ROUGH_RESIDUAL = 1e-3  # of steps without a correction: the next one has another objective anyway
+CORRECTION_RESIDUAL = 1e-2
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
@@ -50,11 +53,13 @@ def gauss_newton_step(
     between = data.times(jnp.sqrt(damping)).plus(stiffness)
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
-    residual = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
+    closely = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
+    residuals = jnp.where(second_order, np.asarray([closely, CORRECTION_RESIDUAL]), ROUGH_RESIDUAL)
     most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
-    def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
+    def solve(move: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""
+        is_step, residual = turn
         rhs = lax.cond(
             is_step,
             lambda: right,
@@ -64,7 +69,8 @@ def gauss_newton_step(
         limited = jnp.where(damped, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 
-    move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
+    turns = np.asarray([True, False]), residuals
+    move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), turns)
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
     whole = within_reach(move + _at_most(LARGEST_CORRECTION, correction, move), longest)
     return net + jnp.where(damped, whole, move), predicted
