@@ -213,6 +213,40 @@ def test_factors_fall_by_fall_squared_and_rise_to_first_with_the_first_fold():
     )
 
 
+def test_early_steps_that_fold_are_taken_again_with_all_factors_four_times_as_great():
+    smoothing, order, yes, no = jf.RegularSmoothing(), (4, 4), jnp.array(True), jnp.array(False)
+    nothing, whole = jnp.zeros((7, 6)), jnp.zeros((4, 3))
+    folded = whole.at[0, 0].set(1.0)
+    begun = FoldGuard(nothing + smoothing.first, nothing + smoothing.least, nothing, nothing, whole)
+
+    def after(guard, step, good=no, folds=folded):
+        new = dataclasses.replace(guard, folds=folds)
+        return smoothing.after(guard, new, yes, good, order, jnp.array(step), jnp.array(40))
+
+    once = after(begun, 1)
+    np.testing.assert_allclose(once.factor, 4 * smoothing.first)
+    np.testing.assert_array_equal(once.held, 0)
+    np.testing.assert_array_equal(once.floor, smoothing.least)
+    np.testing.assert_allclose(after(once, 2).factor, 16 * smoothing.first)
+    assert np.asarray(after(once, 6).held).max() == 1  # late
+    fallen = after(begun, 1, yes, whole)
+    assert np.asarray(after(fallen, 2).held).max() == 1  # after a step with the first factors
+
+
+@pytest.mark.slow
+def test_many_points_to_a_control_point_do_not_crease_a_smooth_surface():
+    def field(x, y):
+        return np.stack([x, y, 0.1 * np.sin(9 * x + 0.5) * np.cos(7 * y)], axis=-1)
+
+    points = field(*np.random.default_rng(0).uniform(size=(2, 100_000)))
+    grid = field(*np.meshgrid(*2 * [np.linspace(0, 1, 200)], indexing="ij"))
+    fit = jf.approximate(
+        points, jf.base_surface(jf.Boundary.from_grid(grid), net=(42, 42)), tol_average=1e-8, max_steps=10
+    )
+    assert fit.average_error < 1e-5
+    assert fit.regularity.folds == fit.stats["points_out_of_reach"] == 0
+
+
 def test_only_bases_near_the_points_and_without_folds_begin_with_less():
     nothing, whole = jnp.zeros((7, 6)), jnp.zeros((4, 3))
     smooth, folded = (FoldGuard(*4 * (nothing,), folds) for folds in (whole, whole.at[0, 0].set(1.0)))

@@ -54,8 +54,9 @@ def gauss_newton_step(
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
     closely = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
-    residuals = jnp.where(second_order, np.asarray([closely, CORRECTION_RESIDUAL]), ROUGH_RESIDUAL)
-    most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
+    both = (closely, CORRECTION_RESIDUAL), (ROUGH_RESIDUAL, ROUGH_RESIDUAL)
+    residuals = lax.select(second_order, *np.asarray(both, right.dtype))
+    most = lax.select(damping < USUAL_DAMPING, *np.asarray((MANY_STEPS, FEW_STEPS), np.int32))
 
     def solve(move: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""

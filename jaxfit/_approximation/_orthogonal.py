@@ -250,7 +250,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
         following = jnp.where(better & ~good, damped.damping, following)
-        following = jnp.where((new.step == 1) & better, self.damping, following)
+        following = jnp.where((new.step == 1) & good, self.damping, following)
         assert before.summary is not None
         assert here.summary is not None
         summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])

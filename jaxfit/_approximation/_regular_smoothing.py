@@ -1,5 +1,6 @@
 r"""`RegularSmoothing`: follows the errors, and is raised where a step would fold the surface."""
 
+import dataclasses
 from functools import cache
 from typing import Any
 
@@ -22,6 +23,9 @@ from jaxfit._normal_equations import Roughness
 # be met exactly the last digits would come slowly.
 FINE = 3e-5
 LONGEST_HOLD = 3.0  # accepted steps for which control points stay, around folds that come again and again
+# One of the first steps, if it would fold a surface that has had no folds, is taken again with factors so
+# much greater everywhere: the more points there are to a control point, the stiffer a first step has to be.
+EARLY_STEPS, STIFFER = 5, 4.0
 # A base whose average error is less than NEAR spacings of the net begins with less smoothing and damping, as
 # steps from there are seldom longer than control points may move; but with no less than LEAST_SHARE of them.
 NEAR, LEAST_SHARE = 0.25, 0.01
@@ -70,7 +74,9 @@ class RegularSmoothing(eqx.Module):
     quarter of the spacing of its free control points, the first factor is `first` times the ratio of the two,
     and so is the first damping. When a first fold has to be kept out, all factors rise to `first`; or, after
     25 iterations and in fits that may not take 40, to what falling by `fall` from the beginning would have
-    left.
+    left. But if one of the first five steps would fold while no factor has fallen below `first`, it
+    is taken again with four times the factors everywhere: clouds with many points to a control point need
+    that.
 
     Parameters
     ----------
@@ -167,21 +173,27 @@ class RegularSmoothing(eqx.Module):
         fresh = near_folds(jnp.maximum(new.folds - old.folds, 0.0), order) & better & ~good
         kept = near_folds(jnp.minimum(new.folds, old.folds), order) & good
         factor, floor, holds, held = jax.tree.map(jnp.asarray, (new.factor, new.floor, new.holds, new.held))
-        floor = lax.select(fresh, jnp.minimum(jnp.maximum(RAISED_FLOOR * factor, floor), self.most), floor)
+        no_fold_yet = jnp.sum(holds) + jnp.sum(old.folds) == 0
+        first_fold = no_fold_yet & jnp.any(fresh)
+        early = first_fold & (step <= EARLY_STEPS) & (jnp.min(factor) >= self.first)
+        late = ~early
+        fresh &= late
+        factor = lax.select(early, STIFFER * factor, factor)
+        floor = lax.select(fresh, jnp.maximum(RAISED_FLOOR * factor, floor), floor)
         floor = lax.select(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
-        no_fold_yet = ~(jnp.any(holds > 0) | jnp.any(jnp.asarray(old.folds) > 0))
         factor = lax.select(good, jnp.maximum(self.fall ** (1 + no_fold_yet) * factor, floor), factor)
-        usual = self.first * self.fall ** (step * ~in_time)
-        factor = jnp.where(jnp.any(fresh) & no_fold_yet, jnp.maximum(factor, usual), factor)
+        again = in_time & (step == RENEWED_AT) & jnp.any(floor > self.least)
+        usual = jnp.where(again, RENEWED, self.fall ** (step * ~in_time)) * self.first
+        risen = again | (first_fold & late)
+        factor = lax.select(risen, jnp.maximum(factor, usual), factor)
+        floor = jnp.where(again, self.least, floor)
         factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
-        again = in_time & (step == RENEWED_AT) & jnp.any(floor > self.least)
-        factor = jnp.where(again, jnp.maximum(factor, RENEWED * self.first), factor)
-        floor = jnp.where(again, self.least, floor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
         # Also where no step is better, as none is while all are held.
         held = lax.select(fresh, holds, jnp.maximum(held - (good | ~better), 0.0))
-        return FoldGuard(factor, floor, holds, held, jnp.where(good, new.folds, old.folds))
+        folds = lax.select(good, new.folds, jnp.asarray(old.folds))
+        return FoldGuard(factor, floor, holds, held, folds)
 
     def lowered(self, guard: "FoldGuard", share: Array) -> "FoldGuard":
         """With this share of the factors, or `least`."""
@@ -191,7 +203,8 @@ class RegularSmoothing(eqx.Module):
     def renewed(self, guard: "FoldGuard", surface: WorkingSurface) -> "FoldGuard":
         """For a surface whose new knots have moved the control points in the net."""
         least = jnp.full_like(guard.factor, self.least)
-        return FoldGuard(least, least, *(jnp.zeros_like(least),) * 2, guard.folds).seeing(surface)
+        zero = jnp.zeros_like(least)
+        return FoldGuard(least, least, zero, zero, guard.folds).seeing(surface)
 
     def has_faded(self, guard: "FoldGuard") -> Bool[Array, ""]:
         """Whether the factor of some control point has fallen to `least`."""
@@ -236,7 +249,7 @@ class FoldGuard(eqx.Module):
 
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""
-        return FoldGuard(self.factor, self.floor, self.holds, self.held, folds_by_cell(surface.pieces))
+        return dataclasses.replace(self, folds=folds_by_cell(surface.pieces))
 
 
 def _kind(x: Any) -> jax.ShapeDtypeStruct:
