@@ -17,7 +17,7 @@ def cores() -> int:
 
 
 def on_all_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
-    """`function` of each part, by threads if there are several: for work that leaves Python to others."""
+    """`function` of each part, in threads if there are several: for work outside Python, as in NumPy."""
     threads = min(len(parts), cores())
     if threads <= 1:
         return [function(part) for part in parts]

@@ -109,6 +109,16 @@ def test_creases_do_not_stop_the_search():
     assert_nearest(surface, np.random.default_rng(0).uniform(-0.3, 1.3, (COUNT, 3)))
 
 
+@pytest.mark.float32_too
+@pytest.mark.parametrize("seed", range(3))
+def test_creases_do_not_stop_the_search_in_single_precision(seed):
+    rng = np.random.default_rng(seed)
+    knots = helpers.clamped_uniform(8, 2)
+    surface = BSplineSurface(*(np.asarray(x, np.float32) for x in (helpers.wavy_net(8, 8), knots, knots)))
+    feet = closest_point(surface, rng.uniform(-0.2, 1.2, (5000, 3)).astype(np.float32))
+    assert feet.converged.all()
+
+
 def test_a_closed_surface_has_feet_on_both_sides_of_its_seam():
     angle = np.linspace(0, 2 * np.pi, 16)
     x, y = 1.0 / np.cos(np.pi / 15) * np.stack([np.cos(angle), np.sin(angle)])

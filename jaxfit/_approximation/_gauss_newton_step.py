@@ -22,7 +22,7 @@ from jaxfit._unrolling import constant, root
 # no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
 FEW_STEPS, MANY_STEPS = 32, 100
-ROUGH_RESIDUAL = 1e-3  # of steps without a correction: the next one has another objective anyway
+ROUGH_RESIDUAL = 1e-3  # of steps without a correction: early ones, at mu = 1 or while smoothing fades
 CORRECTION_RESIDUAL = 1e-2
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
@@ -54,8 +54,8 @@ def gauss_newton_step(
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
     closely = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
-    both = (closely, CORRECTION_RESIDUAL), (ROUGH_RESIDUAL, ROUGH_RESIDUAL)
-    residuals = lax.select(second_order, *np.asarray(both, right.dtype))
+    with_correction, without = (closely, CORRECTION_RESIDUAL), (ROUGH_RESIDUAL, ROUGH_RESIDUAL)
+    residuals = lax.select(second_order, *np.asarray((with_correction, without), right.dtype))
     most = lax.select(damping < USUAL_DAMPING, *np.asarray((MANY_STEPS, FEW_STEPS), np.int32))
 
     def solve(move: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -121,7 +121,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
     loss : Huber(), Tukey() or GemanMcClure(), optional
         For data with outliers (default least squares).
     damping : float
-        mu of the second step, in (0, 1] (default 0.01).
+        mu after the first step, if that is accepted, in (0, 1] (default 0.01).
     reach : float
         The longest move of a control point in a step with mu below 1, correction included, as a share of the
         distance to its neighbours (default 0.6).
@@ -246,7 +246,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
             time = new.step, problem.tolerances.max_steps
             guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, *time)
-        # A step that folds is taken again with more smoothing there, not with more damping everywhere.
+        # A step that folds is taken again with more smoothing, not with more damping.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
         following = jnp.where(better & ~good, damped.damping, following)

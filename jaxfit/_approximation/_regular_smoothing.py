@@ -74,8 +74,8 @@ class RegularSmoothing(eqx.Module):
     quarter of the spacing of its free control points, the first factor is `first` times the ratio of the two,
     and so is the first damping. When a first fold has to be kept out, all factors rise to `first`; or, after
     25 iterations and in fits that may not take 40, to what falling by `fall` from the beginning would have
-    left. But if one of the first five steps would fold while no factor has fallen below `first`, it
-    is taken again with four times the factors everywhere: clouds with many points to a control point need
+    left. But if one of the first five iterations would fold while no factor has fallen below `first`,
+    it is taken again with four times the factors everywhere: clouds with many points to a control point need
     that.
 
     Parameters
@@ -90,7 +90,7 @@ class RegularSmoothing(eqx.Module):
     raised : float
         By how much factors are raised around a fold, more than 1 (default 2).
     most : float
-        The greatest factor (default 1000).
+        The factor up to which they are raised around folds (default 1000).
 
     Raises
     ------
@@ -179,15 +179,17 @@ class RegularSmoothing(eqx.Module):
         late = ~early
         fresh &= late
         factor = lax.select(early, STIFFER * factor, factor)
-        floor = lax.select(fresh, jnp.maximum(RAISED_FLOOR * factor, floor), floor)
+        again = in_time & (step == RENEWED_AT) & jnp.any(floor > self.least)
+        raised_floor = jnp.maximum(jnp.minimum(RAISED_FLOOR * factor, self.most), floor)
+        floor = lax.select(fresh, raised_floor, floor)
         floor = lax.select(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
         factor = lax.select(good, jnp.maximum(self.fall ** (1 + no_fold_yet) * factor, floor), factor)
-        again = in_time & (step == RENEWED_AT) & jnp.any(floor > self.least)
         usual = jnp.where(again, RENEWED, self.fall ** (step * ~in_time)) * self.first
         risen = again | (first_fold & late)
         factor = lax.select(risen, jnp.maximum(factor, usual), factor)
         floor = jnp.where(again, self.least, floor)
-        factor = lax.select(fresh, jnp.minimum(self.raised * factor, self.most), factor)
+        raised = jnp.maximum(jnp.minimum(self.raised * factor, self.most), factor)
+        factor = lax.select(fresh, raised, factor)
         factor = lax.select(kept, jnp.maximum(factor, STUCK * self.least), factor)
         holds = lax.select(fresh, jnp.minimum(2.0 * holds + 1.0, LONGEST_HOLD), holds)
         # Also where no step is better, as none is while all are held.

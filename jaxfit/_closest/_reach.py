@@ -21,9 +21,9 @@ from jaxfit._closest._samples import grid_jet
 from jaxfit._cores import on_all_cores
 from jaxfit._splines._pieces import Axis
 
-SAFETY = 0.3  # of the reach between samples
+SAFETY = 0.3  # of the reach found over pairs of samples
 SHARE_OF_RADIUS = 0.5  # of the least radius of curvature, which is exact at samples
-LEAST_SAMPLES = 16  # intervals between samples along each direction; one a cell where there are more cells
+LEAST_INTERVALS = 16  # between samples along each direction; one a cell where there are more cells
 NEIGHBOURS = 33  # samples around one, itself included
 ADJACENT = 2  # samples so close along both parameters show the curvature
 # How far, in samples along each direction, two points of the surface may move against the samples beside.
@@ -141,7 +141,7 @@ def _cells(axis: Axis) -> int:
 
 
 def _samples_per_cell(axis: Axis) -> int:
-    return -(-LEAST_SAMPLES // _cells(axis))
+    return -(-LEAST_INTERVALS // _cells(axis))
 
 
 def _parameters(axis: Axis) -> tuple[Any, np.ndarray]:

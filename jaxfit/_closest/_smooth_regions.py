@@ -4,7 +4,10 @@ A smooth region is what lies between neighbouring creases, in both directions. A
 until it finds a nearer foot across a crease.
 """
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
@@ -58,8 +61,11 @@ def cross_creases(
     base, across = jnp.where(begins, cell, region.base), jnp.where(begins, jnp.stack(sides), region.across)
     tries, before = jnp.where(begins, 1, region.tries + 1), jnp.where(begins, best, region.before)
     goes_on = found & (across != base).any(0)[None] & (tries <= LAST_TRY)
-    pairs = (base, region.base), (across, region.across), (tries, region.tries), (before, region.before)
-    after = SmoothRegion(*(jnp.where(goes_on, after, before) for after, before in pairs))
+    following = SmoothRegion(base, across, tries, before)
+    # A foot that an earlier try has moved off a crease, by rounding, would wait for ever outside its region.
+    for a, x, cell in zip(axes, new.trial, following.cell, strict=True):
+        goes_on &= ((x >= take(a.low, cell, 0)) & (x <= take(a.high, cell, 0)))[None]
+    after = jax.tree.map(partial(jnp.where, goes_on), following, region)
     return new.with_state(jnp.where(goes_on[0], float(GOING), new.state)), after
 
 
