@@ -70,7 +70,7 @@ def gauss_newton_step(
         limited = jnp.where(damped, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 
-    turns = np.asarray([True, False]), residuals
+    turns = jnp.asarray([True, False]), residuals
     move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), turns)
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
     whole = within_reach(move + _at_most(LARGEST_CORRECTION, correction, move), longest)
