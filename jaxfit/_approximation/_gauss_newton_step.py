@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
@@ -22,8 +21,6 @@ from jaxfit._unrolling import constant, root
 # no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
 FEW_STEPS, MANY_STEPS = 32, 100
-ROUGH_RESIDUAL = 1e-3  # of steps without a correction: early ones, at mu = 1 or while smoothing fades
-CORRECTION_RESIDUAL = 1e-2
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
@@ -53,14 +50,11 @@ def gauss_newton_step(
     between = data.times(jnp.sqrt(damping)).plus(stiffness)
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
-    closely = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
-    with_correction, without = (closely, CORRECTION_RESIDUAL), (ROUGH_RESIDUAL, ROUGH_RESIDUAL)
-    residuals = lax.select(second_order, *np.asarray((with_correction, without), right.dtype))
-    most = lax.select(damping < USUAL_DAMPING, *np.asarray((MANY_STEPS, FEW_STEPS), np.int32))
+    residual = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
+    most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
 
-    def solve(move: Array, turn: tuple[Array, Array]) -> tuple[Array, Array]:
+    def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""
-        is_step, residual = turn
         rhs = lax.cond(
             is_step,
             lambda: right,
@@ -70,8 +64,7 @@ def gauss_newton_step(
         limited = jnp.where(damped, within_reach(solution, longest), solution)
         return jnp.where(is_step, limited, move), solution
 
-    turns = jnp.asarray([True, False]), residuals
-    move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), turns)
+    move, (_, correction) = lax.scan(solve, jnp.zeros_like(net), jnp.asarray([True, False]))
     predicted = jnp.sum(move * (2.0 * right - matrix(move)))
     whole = within_reach(move + _at_most(LARGEST_CORRECTION, correction, move), longest)
     return net + jnp.where(damped, whole, move), predicted

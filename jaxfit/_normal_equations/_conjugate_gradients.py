@@ -29,7 +29,7 @@ def conjugate_gradients(
     matrix: Operator,
     right: Float[Array, "nu nv c"],
     preconditioner: Operator,
-    rtol: Any,
+    rtol: float,
     max_steps: Any,
     coupled: bool,
 ) -> CGSolution:
@@ -57,7 +57,7 @@ def _exactly(matrix: Operator, right: Array, preconditioner: Operator, coupled: 
 
 
 def _iterate(
-    matrix: Operator, right: Array, preconditioner: Operator, rtol: Any, max_steps: Any, coupled: bool
+    matrix: Operator, right: Array, preconditioner: Operator, rtol: float, max_steps: Any, coupled: bool
 ) -> CGSolution:
     def inner(x: Array, y: Array) -> Array:
         return jnp.sum(x * y, axis=None if coupled else (0, 1), keepdims=True)

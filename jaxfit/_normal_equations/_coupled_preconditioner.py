@@ -60,7 +60,7 @@ def solve_coupled(
     right: Float[Array, "nu nv d"],
     free: Bool[Array, "nu nv"],
     preconditioner: CoupledPreconditioner,
-    rtol: Any,
+    rtol: float,
     max_steps: Any,
 ) -> CGSolution:
     """The solution on the free control points, 0 elsewhere, by conjugate gradients."""
