@@ -27,8 +27,9 @@ from jaxfit._compile import compiled
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
 MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
-# The reach costs about as much as the search for so many points for each of its samples.
-LEAST_POINTS_PER_SAMPLE = 6
+# The reach costs about as much as the search for so many points for each of its samples. Where cells are few
+# both cost little, and it spares searches that exchange feet for the same ones with other last digits.
+LEAST_POINTS_PER_SAMPLE, LEAST_POINTS_PER_CELL = 6, 24
 SOME = 4  # points in a cell show whether there are nearer feet elsewhere
 MUCH_NEARER = 0.999  # of a squared distance
 
@@ -178,8 +179,9 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], thorough
         left = np.arange(len(points))
     # The reach is that of a surface in space whose tangent plane nowhere jumps.
     smooth = not (axes[0].creased or axes[1].creased) and axes[1].polynomials.shape[1] > 1
-    many = len(points) >= LEAST_POINTS_PER_SAMPLE * number_of_samples(*axes)
-    if smooth and net.shape[2] == 3 and many:
+    cells = axes[0].cells * axes[1].cells
+    enough = min(LEAST_POINTS_PER_SAMPLE * number_of_samples(*axes), LEAST_POINTS_PER_CELL * cells)
+    if smooth and net.shape[2] == 3 and len(points) >= enough:
         below = Reach(net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
         left = np.flatnonzero(~(below & best["converged"]))
     if left.size:
