@@ -142,3 +142,26 @@ def test_vmap_without_starts_searches_globally():
     alone = closest_point(surface, points).distance
     each = jax.vmap(lambda q: closest_point(surface, q[None]).distance[0])(jnp.asarray(points))
     np.testing.assert_allclose(each, alone, atol=1e-12)
+
+
+@pytest.mark.float32_too
+@pytest.mark.parametrize("unit", [1e-15, 1e-8, 1e15])
+def test_single_precision_serves_any_unit(unit):
+    surface = helpers.wavy_surface(7, 6, dtype=jnp.float32)
+    points = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 3)).astype(np.float32)
+    knots = surface.knots_u, surface.knots_v
+
+    def found(net, points):
+        return closest_point(BSplineSurface(net, *knots), points)
+
+    def slope(found, scale):
+        net, points_in_unit = scale * surface.control_points, jnp.asarray(scale * points)
+        return jax.grad(lambda net: jnp.sum(found(net, points_in_unit).distance))(net)
+
+    scale = np.float32(unit)
+    for way in (found, jax.jit(found)):
+        usual, here = way(surface.control_points, points), way(scale * surface.control_points, scale * points)
+        assert np.mean(np.asarray(here.converged)) >= np.mean(np.asarray(usual.converged)) - 0.02
+        np.testing.assert_allclose(here.distance / scale, usual.distance, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(here.point / scale, usual.point, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(slope(way, scale), slope(way, np.float32(1.0)), rtol=0, atol=1e-3)

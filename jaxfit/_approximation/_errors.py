@@ -107,4 +107,4 @@ class GlobalFeet(AbstractErrors):
 
 
 def _as_feet(found: Any) -> Feet:
-    return found["u"], found["v"], np.sqrt(found["f"]), found["converged"]
+    return found["u"], found["v"], found["distance"], found["converged"]

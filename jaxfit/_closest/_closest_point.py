@@ -229,10 +229,8 @@ def _on_host(
     best = nearest_feet(
         method, net, *axes, np.asarray(points), start=start, tolerance=tolerance, max_steps=max_steps
     )
-    u, v, f, converged = (best[name] for name in ("u", "v", "f", "converged"))
+    u, v, distance, converged = (best[name] for name in ("u", "v", "distance", "converged"))
     status = _status(axes[0].breaks, axes[1].breaks, u, v, converged, orders[1] == 1)
-    with np.errstate(invalid="ignore"):
-        distance = np.sqrt(f)
     # Not jnp.asarray, which compiles a copy for every new size.
     return ClosestPoint(*jax.device_put((u, v, best["point"], distance, converged, status, best["steps"])))
 
@@ -251,29 +249,37 @@ def _traced(
     arrays, points = (arrays[0].astype(dtype), *arrays[1:]), points.astype(dtype)
     if start is not None:
         start = (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype))
-    limits = _length(arrays[0], points, tolerance), jnp.asarray(max_steps, jnp.int32)
+    arrays, points, unit, length = _in_unit(arrays, points, tolerance)
+    limits = length, jnp.asarray(max_steps, jnp.int32)
     u, v, converged, steps = searched_feet(method, arrays, points, start, *limits)
-    return _at_feet((u, v), converged, steps, arrays, points, limits[0])
+    return _at_feet((u, v), converged, steps, arrays, points, length, unit)
 
 
 @compiled
 def _followed(found: ClosestPoint, arrays: Arrays, points: Any, tolerance: Any) -> ClosestPoint:
     """`found` as a function of surface and points."""
-    limit = _length(arrays[0], points, tolerance)
-    return _at_feet((found.u, found.v), found.converged, found.steps, arrays, points, limit)
+    arrays, points, unit, length = _in_unit(arrays, points, tolerance)
+    return _at_feet((found.u, found.v), found.converged, found.steps, arrays, points, length, unit)
 
 
-def _length(net: Array, points: Array, tolerance: Any) -> Array:
-    """The tolerance as a length."""
+def _in_unit(arrays: Arrays, points: Array, tolerance: Any) -> tuple[Arrays, Array, Array, Array]:
+    """Surface and points in a unit that is a power of two near the extent, the unit, and the tolerance in it.
+
+    In single precision squares of very small or large lengths would be 0 or infinite.
+    """
+    net, knots_u, knots_v = arrays
     corners = lax.stop_gradient(jnp.concatenate([net.reshape(-1, net.shape[-1]), points]))
-    size = jnp.linalg.norm(jnp.max(corners, axis=0) - jnp.min(corners, axis=0))
-    return lax.stop_gradient(jnp.asarray(tolerance, size.dtype) * size)
+    box = jnp.max(corners, axis=0) - jnp.min(corners, axis=0)
+    mantissa, _ = jnp.frexp(jnp.max(box))
+    unit = jnp.where(mantissa > 0, jnp.max(box) / jnp.where(mantissa > 0, mantissa, 1.0), 1.0)
+    length = jnp.asarray(lax.stop_gradient(tolerance), box.dtype) * jnp.linalg.norm(box / unit)
+    return (net / unit, knots_u, knots_v), points / unit, unit, length
 
 
 def _at_feet(
-    feet: Any, converged: Array, steps: Array, arrays: Arrays, points: Array, tolerance: Array
+    feet: Any, converged: Array, steps: Array, arrays: Arrays, points: Array, tolerance: Array, unit: Array
 ) -> ClosestPoint:
-    """What there is at known feet, which follow surface and points."""
+    """What there is at known feet, which follow surface and points; both are in this unit."""
     net, knots_u, knots_v = arrays
     u, v = as_feet(feet, arrays, points, tolerance)
     (point,) = evaluate_surface(net, knots_u, knots_v, u, v, ((0, 0),), False)
@@ -284,4 +290,4 @@ def _at_feet(
     ends_u = knots_u[order_u - 1 : knots_u.shape[0] - order_u + 1]
     ends_v = knots_v[order_v - 1 : knots_v.shape[0] - order_v + 1]
     status = _status(ends_u, ends_v, u, v, converged, order_v == 1)
-    return ClosestPoint(u, v, point, distance, converged, status, steps)
+    return ClosestPoint(u, v, point * unit, distance * unit, converged, status, steps)

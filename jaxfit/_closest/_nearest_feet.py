@@ -49,7 +49,7 @@ def nearest_feet(
     used: tuple[int, int] | None = None,
     chunk: int | None = None,
 ) -> HostFeet:
-    """Feet of all points: `u`, `v`, `f` (squared distance), `converged`, `steps`, and `point` on the surface.
+    """Feet of all points: `u`, `v`, `distance`, `converged`, `steps`, and `point` on the surface.
 
     From `start`, a pair (u, v), the feet are local ones. Without it they are the nearest of all: in large
     clouds points whose foot is below the estimated reach of the surface are done, and the others are searched
@@ -63,15 +63,17 @@ def nearest_feet(
         chunk = chunk_size(len(points) if known is None else min(len(points), CHUNK))
     projector = _Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     if start is not None:
-        best = projector(None, *start)
+        best = dict(projector(None, *start))
     else:
         best = _globally(projector, known, used or net.shape[:2], thorough)
     lost = np.flatnonzero(~best["converged"])
     if lost.size:
         best = {name: np.array(x) for name, x in best.items()}
         take_nearer(best, lost, projector(lost, best["u"][lost], best["v"][lost], borders=True))
+    with np.errstate(invalid="ignore"):
+        best["distance"] = np.sqrt(best.pop("f")) * projector.unit
     if "point" in best:
-        best["point"] = best["point"].T + projector.centre.astype(net.dtype)[None, :]
+        best["point"] = best["point"].T * projector.unit + projector.centre.astype(net.dtype)[None, :]
     return best
 
 
@@ -108,7 +110,11 @@ def _run(
 
 
 class _Projector:
-    """Local feet of some of the points from starts, always in the same shapes."""
+    """Local feet of some of the points from starts, always in the same shapes.
+
+    Lengths are in a `unit`, a power of two near the extent: in single precision squares of very small or
+    large numbers would be 0 or infinite.
+    """
 
     def __init__(
         self,
@@ -126,7 +132,11 @@ class _Projector:
         self.net = net - self.centre
         self.centred = np.empty(points.shape[::-1])
         np.subtract(points.T, self.centre[:, None], out=self.centred)
-        extent = self.dtype.type(tolerance * _extent(self.net, self.centred))
+        box = _box(self.net, self.centred)
+        self.unit = float(np.ldexp(1.0, np.frexp(box.max())[1])) if 0 < box.max() < np.inf else 1.0
+        self.net /= self.unit
+        self.centred /= self.unit
+        extent = self.dtype.type(tolerance * np.linalg.norm(box / self.unit))
         self.limits = extent, np.int32(max_steps)
 
     @cached_property
@@ -171,7 +181,8 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], thorough
     else:
         names = ("u", "v", "distance", "converged")
         best = {name: np.array(x) for name, x in zip(names, known, strict=True)}
-        best |= {"f": best.pop("distance") ** 2, "steps": np.zeros(len(points), np.int32)}
+        squares = (best.pop("distance") / projector.unit) ** 2
+        best |= {"f": squares, "steps": np.zeros(len(points), np.int32)}
         left = np.flatnonzero(~best["converged"])
         if left.size:
             search = Search(sample(net.astype(projector.dtype), *axes))
@@ -264,11 +275,11 @@ def _middle(net: np.ndarray) -> np.ndarray:
     return 0.5 * (net.min(axis=(0, 1)) + net.max(axis=(0, 1)))
 
 
-def _extent(net: np.ndarray, centred: np.ndarray) -> float:
-    """Diagonal of the box around control points and queries."""
+def _box(net: np.ndarray, centred: np.ndarray) -> np.ndarray:
+    """The sides of the box around control points and queries."""
     low = np.minimum(net.min(axis=(0, 1)), centred.min(axis=1))
     high = np.maximum(net.max(axis=(0, 1)), centred.max(axis=1))
-    return float(np.linalg.norm(high - low))
+    return high - low
 
 
 def take_nearer(best: HostFeet, which: np.ndarray, other: HostFeet) -> None:
