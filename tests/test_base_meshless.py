@@ -114,6 +114,20 @@ def test_boundary_vertices_and_duplicates_get_what_they_must():
     np.testing.assert_allclose(v[351:], arc / arc[-1], atol=1e-12)
 
 
+@pytest.mark.float32_too
+def test_a_boundary_that_has_been_rounded_has_the_same_points_on_it():
+    x, y = np.meshgrid(np.linspace(0, 1, 31), np.linspace(0, 1, 29) ** 1.3, indexing="ij")
+    grid = np.stack([x, y, 0.3 * np.sin(6 * x) * np.sin(5 * y + 1)], axis=2)
+    points, base = grid.reshape(-1, 3), []
+    for dtype in (np.float64, np.float32):
+        boundary = jf.Boundary.from_grid(grid.astype(dtype))
+        base.append(nets(points, boundary).astype(float))
+        u, v = jf.meshless_parameters(points, boundary)
+        border = (x.ravel() % 1 == 0) | (y.ravel() % 1 == 0)
+        assert np.all(((u % 1 == 0) | (v % 1 == 0))[border])
+    np.testing.assert_allclose(base[0], base[1], rtol=0, atol=1e-4)
+
+
 def test_an_overhang_is_carried():
     # A ball cut off below: the height goes up, over and in again, so that sides lie under the top.
     cut = 0.75

@@ -15,7 +15,9 @@ from jaxfit._checks import as_points, check_number, eager_where_concrete, is_con
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
 NODE_SPACING = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
-COINCIDENT = 1e-9  # a point this near a node of the boundary (times the diagonal) is that node
+# A point is a node of the boundary if it is this near, times the cloud's spacing: one of the two may have
+# been rounded, as where they come from different files or the boundary is in single precision.
+COINCIDENT = 1e-3
 LINK_ROUNDS = 6  # rounds in which links that stay long lose weight
 
 
@@ -49,8 +51,8 @@ def meshless_parameters(
     Parameters
     ----------
     points : array (points, d), d >= 2
-        Any unit, any order. Those within 1e-9 of the diagonal of a vertex of the boundary get its
-        parameters.
+        Any unit, any order. Those nearer to a vertex of the boundary than a thousandth of the median
+        distance between points get its parameters.
     boundary : Boundary
         Four polylines. Nodes are added to sides whose edges are longer than the cloud's spacing.
     neighbours : int
@@ -150,7 +152,7 @@ def _nodes(points: np.ndarray, sides: list[np.ndarray]) -> _Nodes:
         places.append(np.stack([along, across] if k < 2 else [across, along], axis=1))
     whole, place = np.concatenate(rims), np.concatenate(places)
     far, nearest = cKDTree(whole).query(points)
-    away = far > COINCIDENT
+    away = far > COINCIDENT * min(spacing, 1.0)
     kept = np.arange(len(whole))
     if away.any():
         parts = np.split(cKDTree(points[away]).query(whole)[0], np.cumsum([len(x) for x in rims[:-1]]))
