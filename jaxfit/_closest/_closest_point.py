@@ -263,16 +263,15 @@ def _followed(found: ClosestPoint, arrays: Arrays, points: Any, tolerance: Any) 
 
 
 def _in_unit(arrays: Arrays, points: Array, tolerance: Any) -> tuple[Arrays, Array, Array, Array]:
-    """Surface and points in a unit that is a power of two near the extent, the unit, and the tolerance in it.
+    """Surface and points in the unit of their extent, that unit, and the tolerance in it.
 
     In single precision squares of very small or large lengths would be 0 or infinite.
     """
     net, knots_u, knots_v = arrays
     corners = lax.stop_gradient(jnp.concatenate([net.reshape(-1, net.shape[-1]), points]))
-    box = jnp.max(corners, axis=0) - jnp.min(corners, axis=0)
-    mantissa, _ = jnp.frexp(jnp.max(box))
-    unit = jnp.where(mantissa > 0, jnp.max(box) / jnp.where(mantissa > 0, mantissa, 1.0), 1.0)
-    length = jnp.asarray(lax.stop_gradient(tolerance), box.dtype) * jnp.linalg.norm(box / unit)
+    size = jnp.linalg.norm(jnp.max(corners, axis=0) - jnp.min(corners, axis=0))
+    unit = jnp.where(size > 0, size, 1.0)
+    length = lax.stop_gradient(jnp.asarray(tolerance, size.dtype))
     return (net / unit, knots_u, knots_v), points / unit, unit, length
 
 

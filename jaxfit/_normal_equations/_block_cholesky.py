@@ -2,10 +2,10 @@
 
 Numbered row by row the matrix is block-banded: a row of the net is coupled with the K - 1 next ones. Each
 step inverts the nv x nv block D of one row and takes what it leaves off a window of K - 1 rows to come, so
-that nearly all the work is one product of matrices a step, and nothing outside the band is touched.
+that nearly all the work is a few products of matrices a step, and nothing outside the band is touched.
 
-The blocks are inverted here, by sweeps. A call to LAPACK for each would be no faster, and its threads wait
-for one another so badly where cores are shared that it may be a hundred times slower.
+The blocks are inverted here. A call to LAPACK for each would be no faster, and its threads wait for one
+another so badly where cores are shared that it may be a hundred times slower.
 """
 
 from typing import Any
@@ -86,12 +86,12 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
         added = shift * unit * jnp.maximum(jnp.diagonal(column[0]), floor)[:, None]
         own = jnp.where(mask[0][:, None], column[0] + added, unit)
         rest = column[1:].reshape(reach, nv) - _with_row_below(window[0][nv:])
-        inverse, least = _inverted(own - window[0][:nv], jnp.diagonal(own))
-        below = rest @ inverse
-        after = [below[j * nv :] @ rest[j * nv : (j + 1) * nv].T for j in range(order - 1)]
+        root, least = _inverse_root(own - window[0][:nv], jnp.diagonal(own))
+        half = rest @ root.T
+        after = [half[j * nv :] @ half[j * nv : (j + 1) * nv].T for j in range(order - 1)]
         kept = [_with_row_below(x) for x in window[1:]]
         after = [x + y for x, y in zip(kept, after, strict=False)] + after[order - 2 :]
-        return after, (jnp.concatenate([inverse, -below]), least)
+        return after, (jnp.concatenate([root.T, -half]) @ root, least)
 
     def _with_row_below(x: Array) -> Array:
         return jnp.pad(x, ((0, nv), (0, 0)))
@@ -103,27 +103,34 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
     return blocks, jnp.min(least)
 
 
-def _inverted(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Array, Array]:
-    """The inverse of a positive definite matrix by sweeping out one row after the other, and the least pivot
-    as a share of `size`; stable without exchanging rows."""
-    count = block.shape[0]
-    number = jnp.arange(count)
+def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Array, Array]:
+    """R with R^T R the inverse of a positive definite matrix, and its least pivot as a share of `size`.
 
-    def sweep(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    By eliminating one row after the other. With the inverse itself in place of R rounding would grow by the
+    condition of the block instead of its root, and in single precision bury large shapes.
+    """
+    count, dtype = block.shape[0], block.dtype
+    number, unit = np.arange(count), np.eye(count, dtype=dtype)
+
+    def eliminate(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, least = carry
         zero = np.zeros((), k.dtype)
         row = lax.dynamic_slice(matrix, (k, zero), (1, count), allow_negative_indices=False)
         column = lax.dynamic_slice(matrix, (zero, k), (count, 1), allow_negative_indices=False)
         pivot = lax.dynamic_slice(row, (zero, k), (1, 1), allow_negative_indices=False)
         own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
-        across, along = (number == k)[None, :], (number == k)[:, None]
-        share = jnp.where(along, -1.0, column) * (jnp.where(across, -1.0, row) / pivot)
-        swept = jnp.where(across | along, 0.0, matrix) - share
-        return swept, jnp.minimum(least, pivot[0] / own)
+        across, after = number[None] == k, number[:, None] > k
+        # The column that is eliminated makes room for that of the inverse.
+        share = lax.select(after, column / pivot, np.zeros_like(unit[:, :1]))
+        share *= lax.select(across, np.ones_like(unit[:1]), row)
+        rest = lax.select(across & after, np.zeros_like(unit), matrix)
+        return rest - share, jnp.minimum(least, pivot[0] / own)
 
     most = jnp.full_like(size[:1], jnp.inf)
-    swept, least = lax.fori_loop(0, count, sweep, (block, most))
-    return -swept, least
+    matrix, least = lax.fori_loop(0, count, eliminate, (block, most))
+    lower = lax.select(number[:, None] > number, matrix, unit)
+    pivots = jnp.sum(matrix * unit, axis=1, keepdims=True)
+    return lower * lax.rsqrt(jnp.maximum(pivots, jnp.finfo(dtype).tiny)), least
 
 
 def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
