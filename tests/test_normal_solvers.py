@@ -14,6 +14,7 @@ from jaxfit._normal_equations import (
     TensorPreconditionedCG,
     free_points,
 )
+from jaxfit._normal_equations._block_cholesky import factorise, substitute
 
 
 @pytest.fixture(scope="module")
@@ -90,3 +91,22 @@ def test_derivatives_go_through_the_solution(stencil):
     difference = (value(jnp.asarray(step)) - value(jnp.asarray(-step))) / (2 * step)
     slope = jax.jit(jax.grad(value))(jnp.asarray(0.0))
     assert abs(float(slope - difference)) < 1e-6 * abs(float(difference))
+
+
+@pytest.mark.float32_too
+def test_factors_in_single_precision_keep_large_shapes():
+    count, stiff = 40, 3e3
+    bends = np.diff(np.eye(count), 2, axis=0)
+    bending, unit = bends.T @ bends, np.eye(count)
+    matrix = np.kron(unit, unit) + stiff * (np.kron(bending, unit) + np.kron(unit, bending))
+    entries = np.zeros((3, 3, count, count))
+    for a in range(3):
+        entries[a, 0, : count - a] += stiff * np.diagonal(bending, a)[:, None]
+        entries[0, a, :, : count - a] += stiff * np.diagonal(bending, a)[None]
+    entries[0, 0] += 1.0
+    right = np.sin(np.linspace(0, 3, count))[:, None] * np.cos(np.linspace(0, 2, count))
+    exact = np.linalg.solve(matrix, right.ravel()).reshape(count, count)
+    factors = factorise(Stencil(jnp.asarray(entries, jnp.float32)), jnp.ones((count, count), bool))
+    found = substitute(factors, jnp.asarray(right[None], jnp.float32))[0]
+    assert float(factors.shift) == 0.0
+    assert np.linalg.norm(found - exact) < 0.02 * np.linalg.norm(exact)
