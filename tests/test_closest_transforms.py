@@ -145,7 +145,7 @@ def test_vmap_without_starts_searches_globally():
 
 
 @pytest.mark.float32_too
-@pytest.mark.parametrize("unit", [1e-15, 1e-8, 1e15])
+@pytest.mark.parametrize("unit", [1e-25, 1e-8, 1e20])
 def test_single_precision_serves_any_unit(unit):
     surface = helpers.wavy_surface(7, 6, dtype=jnp.float32)
     points = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 3)).astype(np.float32)
@@ -165,3 +165,19 @@ def test_single_precision_serves_any_unit(unit):
         np.testing.assert_allclose(here.distance / scale, usual.distance, rtol=0, atol=1e-5)
         np.testing.assert_allclose(here.point / scale, usual.point, rtol=0, atol=1e-4)
         np.testing.assert_allclose(slope(way, scale), slope(way, np.float32(1.0)), rtol=0, atol=1e-3)
+
+
+@pytest.mark.float32_too
+def test_nothing_is_rounded_far_from_the_origin():
+    corner = np.array([1e6, 2e6, 0.0], np.float32)
+    x, y = np.meshgrid([0.0, 8.0], [0.0, 8.0], indexing="ij")
+    net = np.stack([x, y, 0 * x], axis=2).astype(np.float32) + corner
+    knots = np.array([0.0, 0.0, 1.0, 1.0], np.float32)
+    points = corner + np.array([[3.0, 4.0, 0.75], [6.0, 1.0, 0.5]], np.float32)
+
+    def distance(points):
+        return closest_point(BSplineSurface(net, knots, knots), points).distance
+
+    value, _ = jax.jvp(distance, (jnp.asarray(points),), (jnp.ones_like(points),))
+    np.testing.assert_array_equal(value, distance(points))
+    np.testing.assert_array_equal(value, [0.75, 0.5])

@@ -18,6 +18,7 @@ NODE_SPACING = 0.7  # nodes of a side are at least so far apart, times their dis
 # A point is a node of the boundary if it is this near, times the cloud's spacing: one of the two may have
 # been rounded, as where they come from different files or the boundary is in single precision.
 COINCIDENT = 1e-3
+LEAST_COINCIDENT = 1e-9  # of the diagonal
 LINK_ROUNDS = 6  # rounds in which links that stay long lose weight
 
 
@@ -52,7 +53,7 @@ def meshless_parameters(
     ----------
     points : array (points, d), d >= 2
         Any unit, any order. Those nearer to a vertex of the boundary than a thousandth of the median
-        distance between points get its parameters.
+        distance from a point to the nearest other one get its parameters.
     boundary : Boundary
         Four polylines. Nodes are added to sides whose edges are longer than the cloud's spacing.
     neighbours : int
@@ -152,7 +153,7 @@ def _nodes(points: np.ndarray, sides: list[np.ndarray]) -> _Nodes:
         places.append(np.stack([along, across] if k < 2 else [across, along], axis=1))
     whole, place = np.concatenate(rims), np.concatenate(places)
     far, nearest = cKDTree(whole).query(points)
-    away = far > COINCIDENT * min(spacing, 1.0)
+    away = far > max(COINCIDENT * min(spacing, 1.0), LEAST_COINCIDENT)
     kept = np.arange(len(whole))
     if away.any():
         parts = np.split(cKDTree(points[away]).query(whole)[0], np.cumsum([len(x) for x in rims[:-1]]))

@@ -10,7 +10,7 @@ from jaxfit._precision import bucket
 from jaxfit._splines._pieces import Axis
 
 CHUNK = 1 << 15  # points at a time: one program serves all clouds that have more
-HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance), converged, steps; one entry a point
+HostFeet = dict[str, np.ndarray]  # u, v, f (squared distance) or distance, converged, steps; by point
 
 
 def chunk_size(count: int) -> int:

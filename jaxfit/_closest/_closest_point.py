@@ -263,22 +263,26 @@ def _followed(found: ClosestPoint, arrays: Arrays, points: Any, tolerance: Any) 
 
 
 def _in_unit(arrays: Arrays, points: Array, tolerance: Any) -> tuple[Arrays, Array, Array, Array]:
-    """Surface and points in the unit of their extent, that unit, and the tolerance in it.
+    """Surface and points in a unit near their extent, that unit, and the tolerance in it.
 
-    In single precision squares of very small or large lengths would be 0 or infinite.
+    In single precision squares of very small or large lengths would be 0 or infinite. The unit is a power of
+    two, so that nothing is rounded.
     """
     net, knots_u, knots_v = arrays
     corners = lax.stop_gradient(jnp.concatenate([net.reshape(-1, net.shape[-1]), points]))
-    size = jnp.linalg.norm(jnp.max(corners, axis=0) - jnp.min(corners, axis=0))
-    unit = jnp.where(size > 0, size, 1.0)
-    length = lax.stop_gradient(jnp.asarray(tolerance, size.dtype))
+    box = jnp.max(corners, axis=0) - jnp.min(corners, axis=0)
+    unit = lax.reduce_precision(jnp.max(box), jnp.finfo(box.dtype).nexp, 0)
+    unit = lax.select((unit > 0) & (unit < jnp.inf), unit, np.ones((), box.dtype))
+    length = lax.stop_gradient(jnp.asarray(tolerance, box.dtype) * jnp.linalg.norm(box / unit))
     return (net / unit, knots_u, knots_v), points / unit, unit, length
 
 
 def _at_feet(
     feet: Any, converged: Array, steps: Array, arrays: Arrays, points: Array, tolerance: Array, unit: Array
 ) -> ClosestPoint:
-    """What there is at known feet, which follow surface and points; both are in this unit."""
+    """What there is at known feet, which follow surface and points; these and the tolerance are in `unit`,
+    the result is not.
+    """
     net, knots_u, knots_v = arrays
     u, v = as_feet(feet, arrays, points, tolerance)
     (point,) = evaluate_surface(net, knots_u, knots_v, u, v, ((0, 0),), False)

@@ -133,7 +133,7 @@ class _Projector:
         self.centred = np.empty(points.shape[::-1])
         np.subtract(points.T, self.centre[:, None], out=self.centred)
         box = _box(self.net, self.centred)
-        self.unit = float(np.ldexp(1.0, np.frexp(box.max())[1])) if 0 < box.max() < np.inf else 1.0
+        self.unit = float(np.ldexp(1.0, np.frexp(box.max())[1] - 1)) if 0 < box.max() < np.inf else 1.0
         self.net /= self.unit
         self.centred /= self.unit
         extent = self.dtype.type(tolerance * np.linalg.norm(box / self.unit))

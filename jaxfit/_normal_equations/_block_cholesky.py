@@ -1,4 +1,4 @@
-"""Cholesky factors of a stencil, without roots, one row of the net at a time: S = X D X^T.
+"""Cholesky factors of a stencil, kept without roots, one row of the net at a time: S = X D X^T.
 
 Numbered row by row the matrix is block-banded: a row of the net is coupled with the K - 1 next ones. Each
 step inverts the nv x nv block D of one row and takes what it leaves off a window of K - 1 rows to come, so
@@ -106,8 +106,9 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
 def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple[Array, Array]:
     """R with R^T R the inverse of a positive definite matrix, and its least pivot as a share of `size`.
 
-    By eliminating one row after the other. With the inverse itself in place of R rounding would grow by the
-    condition of the block instead of its root, and in single precision bury large shapes.
+    By eliminating one row after the other. What a row leaves to the next ones is taken from R: taken from the
+    inverse it would be wrong by rounding times the condition number of the block, not times its square root,
+    and in single precision little would be left of smooth solutions.
     """
     count, dtype = block.shape[0], block.dtype
     number, unit = np.arange(count), np.eye(count, dtype=dtype)
@@ -120,7 +121,7 @@ def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple
         pivot = lax.dynamic_slice(row, (zero, k), (1, 1), allow_negative_indices=False)
         own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
         across, after = number[None] == k, number[:, None] > k
-        # The column that is eliminated makes room for that of the inverse.
+        # The column that is eliminated makes room for one of the lower factor's inverse.
         share = lax.select(after, column / pivot, np.zeros_like(unit[:, :1]))
         share *= lax.select(across, np.ones_like(unit[:1]), row)
         rest = lax.select(across & after, np.zeros_like(unit), matrix)
@@ -130,7 +131,8 @@ def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple
     matrix, least = lax.fori_loop(0, count, eliminate, (block, most))
     lower = lax.select(number[:, None] > number, matrix, unit)
     pivots = jnp.sum(matrix * unit, axis=1, keepdims=True)
-    return lower * lax.rsqrt(jnp.maximum(pivots, jnp.finfo(dtype).tiny)), least
+    smallest = max(LEAST_PIVOT, ROUNDING[0] * float(jnp.finfo(dtype).eps))
+    return lower * lax.rsqrt(jnp.maximum(pivots, smallest * size[:, None])), least
 
 
 def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:

@@ -116,7 +116,8 @@ class ShiftedProducts(eqx.Module):
                     total += entries * part_of(lines, (number, there), count)
             return total, None
 
-        begin = as_varying(jnp.zeros((max(p, count), places), x.dtype), self.entries, x)
+        dtype = jnp.result_type(self.entries, x)
+        begin = as_varying(jnp.zeros((max(p, count), places), dtype), self.entries, x)
         total, _ = lax.scan(products, begin, (a, b, stored, neighbours))
         return total.reshape(-1, nu, width)[:, :, :nv]
 
