@@ -29,7 +29,7 @@ ENTRIES = {
     "approximate, geometric": (approximated(jf.GeometricApproximation()), POINTS, 1780),
     "approximate, paper": (approximated(jf.GeometricApproximation.paper()), POINTS, 2380),
     "approximate, standard": (approximated(jf.StandardApproximation(smoothing=1e-5)), POINTS, 2500),
-    "approximate, orthogonal": (approximated(jf.OrthogonalDistance()), POINTS, 4460),
+    "approximate, orthogonal": (approximated(jf.OrthogonalDistance()), POINTS, 4450),
     "closest_point": (lambda points: jf.closest_point(BASE, points).u, POINTS, 1840),
     "interpolate, geometric": (GEOMETRIC, GRID, 2500),
     "interpolate, geometric, gradient": (jax.grad(lambda grid: GEOMETRIC(grid).sum()), GRID, 5000),

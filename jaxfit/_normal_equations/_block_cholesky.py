@@ -83,7 +83,7 @@ def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
         number, bands = row
         mask = lax.dynamic_slice_in_dim(ahead, number, order)
         column = jnp.where(mask[:, :, None] & mask[0][None, None, :], _blocks(bands), 0.0)
-        added = shift * unit * jnp.maximum(jnp.diagonal(column[0]), floor)[:, None]
+        added = shift * unit * jnp.maximum(bands[0, 0], floor)[:, None]
         own = jnp.where(mask[0][:, None], column[0] + added, unit)
         rest = column[1:].reshape(reach, nv) - _with_row_below(window[0][nv:])
         root, least = _inverse_root(own - window[0][:nv], jnp.diagonal(own))
@@ -114,25 +114,24 @@ def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple
     number, unit = np.arange(count), np.eye(count, dtype=dtype)
 
     def eliminate(k: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        matrix, least = carry
+        matrix, pivots = carry
         zero = np.zeros((), k.dtype)
         row = lax.dynamic_slice(matrix, (k, zero), (1, count), allow_negative_indices=False)
         column = lax.dynamic_slice(matrix, (zero, k), (count, 1), allow_negative_indices=False)
         pivot = lax.dynamic_slice(row, (zero, k), (1, 1), allow_negative_indices=False)
-        own = lax.dynamic_slice(size, (k,), (1,), allow_negative_indices=False)
         across, after = number[None] == k, number[:, None] > k
         # The column that is eliminated makes room for one of the lower factor's inverse.
         share = lax.select(after, column / pivot, np.zeros_like(unit[:, :1]))
         share *= lax.select(across, np.ones_like(unit[:1]), row)
-        rest = lax.select(across & after, np.zeros_like(unit), matrix)
-        return rest - share, jnp.minimum(least, pivot[0] / own)
+        rest = lax.select(jnp.broadcast_to(across, unit.shape), np.zeros_like(unit), matrix)
+        pivots = lax.dynamic_update_slice(pivots, pivot, (k, zero), allow_negative_indices=False)
+        return rest - share, pivots
 
-    most = jnp.full_like(size[:1], jnp.inf)
-    matrix, least = lax.fori_loop(0, count, eliminate, (block, most))
+    scale = size[:, None]
+    matrix, pivots = lax.fori_loop(0, count, eliminate, (block, scale))
     lower = lax.select(number[:, None] > number, matrix, unit)
-    pivots = jnp.sum(matrix * unit, axis=1, keepdims=True)
     smallest = max(LEAST_PIVOT, ROUNDING[0] * float(jnp.finfo(dtype).eps))
-    return lower * lax.rsqrt(jnp.maximum(pivots, smallest * size[:, None])), least
+    return lower * lax.rsqrt(jnp.maximum(pivots, smallest * scale)), jnp.min(pivots / scale)
 
 
 def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:

@@ -41,7 +41,7 @@ class CoupledPreconditioner(eqx.Module):
     def _rotated(self, x: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
         products = self.roots * x[:, None]
         # Added one by one: a sum over the first axis takes a CPU ten times as long where nets are large.
-        return reduce(add, lax.split(products, (1,) * x.shape[0], 0))[0]
+        return reduce(add, lax.split(products, (1,) * x.shape[0], 0)).reshape(x.shape)
 
 
 def coupled_preconditioner(
