@@ -250,7 +250,7 @@ def test_many_points_to_a_control_point_do_not_crease_a_smooth_surface():
 def test_only_bases_near_the_points_and_without_folds_begin_with_less():
     nothing, whole = jnp.zeros((7, 6)), jnp.zeros((4, 3))
     smooth, folded = (FoldGuard(*4 * (nothing,), folds) for folds in (whole, whole.at[0, 0].set(1.0)))
-    cases = ((smooth, 0, 0.02, 0.1), (smooth, 0, 0.049, 0.245), (smooth, 0, 0.0, 0.01))
+    cases = ((smooth, 0, 0.04, 0.04), (smooth, 0, 0.049, 0.245**2), (smooth, 0, 0.0, 0.01))
     cases += ((smooth, 0, 0.051, 1.0), (smooth, 1, 0.02, 1.0), (folded, 0, 0.02, 1.0))
     for guard, step, error, share in cases:
         at_base = guard.share_at_base(jnp.array(step), jnp.array(error), jnp.array(0.2))

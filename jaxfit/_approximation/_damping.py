@@ -21,6 +21,9 @@ RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding.
 EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
+# Steps damped less get a second-order correction. Earlier ones come no closer with it, for each solves
+# another problem than the last one, with less damping and smoothing.
+CORRECTED_BELOW = 2e-3
 LONGEST_MOVE = 4.0  # of a foot, in cells, in a step whose reduction is not GOOD
 
 

@@ -20,7 +20,7 @@ from jaxfit._unrolling import constant, root
 # little if sums are rounded otherwise. Or after so many steps: few, for far from the end an exact solution is
 # no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
-FEW_STEPS, MANY_STEPS = 32, 100
+FEW_STEPS, MANY_STEPS = 16, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 

@@ -12,6 +12,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._approximation._damping import (
+    CORRECTED_BELOW,
     GUARDED_DAMPING,
     USUAL_DAMPING,
     DampingState,
@@ -93,10 +94,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
     whatever the curvature. The part left out lies in the tangent space and is of second order in the
     distances.
 
-    Where the net slides along the surface the distances change to second order only. So each step gets a
-    correction (geodesic acceleration): the solution of the same system for the second derivatives of the
-    residuals along the step, at the same feet and at most 0.75 times as long as the step. While the weight of
-    `RegularSmoothing` still fades everywhere there is none: the next step has another objective anyway.
+    Where the net slides along the surface the distances change to second order only. So steps with mu below
+    0.002 get a correction (geodesic acceleration): the solution of the same system for the second derivatives
+    of the residuals along the step, at the same feet and at most 0.75 times as long as the step. While the
+    weight of `RegularSmoothing` still fades everywhere there is none: the next step has another objective
+    anyway.
 
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1, or less where
@@ -297,7 +299,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         def solve(penalty: Any, *x: Any) -> tuple[Array, Array]:
             return gauss_newton_step(penalty, correction_rhs, *x)
 
-        second_order = damping < 1
+        second_order = damping < CORRECTED_BELOW
         if guard is not None:
             second_order &= self.smoothing.has_faded(guard)
         args = (penalty, equations, net, held, longest, damping, second_order)

@@ -71,12 +71,12 @@ class RegularSmoothing(eqx.Module):
 
     From a base surface without folds fewer steps are enough. Until a first fold has to be kept out, the
     factors fall by `fall` squared. If the distance of the points from the base is on average less than a
-    quarter of the spacing of its free control points, the first factor is `first` times the ratio of the two,
-    and so is the first damping. When a first fold has to be kept out, all factors rise to `first`; or, after
-    25 iterations and in fits that may not take 40, to what falling by `fall` from the beginning would have
-    left. But if one of the first five iterations would fold while no factor has fallen below `first`,
-    it is taken again with four times the factors everywhere: clouds with many points to a control point need
-    that.
+    quarter of the spacing of its free control points, the first factor is `first` times the square of the
+    ratio of the two, or `least`, and the first damping is the square of the ratio. When a first fold has to
+    be kept out, all factors rise to `first`; or, after 25 iterations and in fits that may not take 40, to
+    what falling by `fall` from the beginning would have left. But if one of the first five iterations would
+    fold while no factor has fallen below `first`, it is taken again with four times the factors everywhere:
+    clouds with many points to a control point need that.
 
     Parameters
     ----------
@@ -244,10 +244,12 @@ class FoldGuard(eqx.Module):
 
     def share_at_base(self, step: Any, error: Array, spacing: Array) -> Float[Array, ""]:
         """The share of the usual smoothing and damping that a step takes: for the first one from a base that
-        is NEAR and has no folds the average error over the average `spacing` of the net, otherwise 1.
+        is NEAR and has no folds the square of the average error over the average `spacing` of the net,
+        otherwise 1.
         """
         near = (step == 0) & (error < NEAR * spacing) & ~jnp.any(jnp.asarray(self.folds) > 0)
-        return jnp.where(near, jnp.maximum(error / jnp.where(near, spacing, 1.0), LEAST_SHARE), 1.0)
+        ratio = error / jnp.where(near, spacing, 1.0)
+        return jnp.where(near, jnp.maximum(ratio**2, LEAST_SHARE), 1.0)
 
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""
