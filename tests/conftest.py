@@ -99,3 +99,8 @@ def pytest_runtest_teardown(item, nextitem):
         return
     if maps.read_bytes().count(b"\n") > MOST_MAPPINGS:
         jax.clear_caches()
+        from jaxfit import _compile_ahead  # not before its annotations are checked
+
+        # Without this no program that is gone would be compiled ahead a second time.
+        _compile_ahead._begun.clear()
+        _compile_ahead._asked.clear()
