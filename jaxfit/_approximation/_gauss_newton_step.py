@@ -17,10 +17,11 @@ from jaxfit._normal_equations import (
 from jaxfit._unrolling import constant, root
 
 # Conjugate gradients stop at this relative residual, which they reach where nets are small: there fits differ
-# little if sums are rounded otherwise. Or after so many steps: few, for far from the end an exact solution is
-# no better. At small mu steps achieve what they predict, and the last digits take many.
+# little if sums are rounded otherwise. Or after so many steps: few where nets are large, for far from the end
+# an exact solution is no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
-FEW_STEPS, MANY_STEPS = 16, 100
+SMALL_NET = 1000  # control points
+FEW_STEPS, SOME_STEPS, MANY_STEPS = 16, 32, 100
 LARGEST_CORRECTION = 0.75  # of second order, as a share of the step
 
 
@@ -51,7 +52,8 @@ def gauss_newton_step(
     preconditioner = coupled_preconditioner(constant(matrix), constant(between), free)
     damped = damping < 1
     residual = max(RESIDUAL, 10.0 * float(jnp.finfo(right.dtype).eps))
-    most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, FEW_STEPS)
+    usual = FEW_STEPS if net.shape[0] * net.shape[1] > SMALL_NET else SOME_STEPS
+    most = jnp.where(damping < USUAL_DAMPING, MANY_STEPS, usual)
 
     def solve(move: Array, is_step: Array) -> tuple[Array, Array]:
         """The move, and then its correction, whose right-hand side depends on the move."""
