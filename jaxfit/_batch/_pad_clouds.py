@@ -59,7 +59,7 @@ def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None 
     -----
     A fit inside a transformation has parameters and errors for the padding, too, which mean nothing. Sums are
     made in another order than without the padding, so that results differ by rounding; `OrthogonalDistance`,
-    whose steps are solved to 1e-5, makes it as much as 1e-5 of the diagonal before the fit is at rest.
+    whose systems are solved by a limited number of iterations, magnifies it until the fit is at rest.
     `map_fits` takes clouds of different sizes as they are.
 
     Examples
