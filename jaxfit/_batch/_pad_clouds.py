@@ -58,8 +58,10 @@ def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None 
     Notes
     -----
     A fit inside a transformation has parameters and errors for the padding, too, which mean nothing. Sums are
-    made in another order than without the padding, so that results differ by rounding; `OrthogonalDistance`,
-    whose systems are solved by a limited number of iterations, magnifies it until the fit is at rest.
+    made in another order than without the padding, so that results differ by rounding. `OrthogonalDistance`
+    solves its systems with a limited number of conjugate gradient iterations, and these differences grow from
+    step to step until the fit has converged: 5e-11 of the diagonal after 5 steps and 7e-8 after 20 for 3,000
+    points and 11x15 control points.
     `map_fits` takes clouds of different sizes as they are.
 
     Examples
