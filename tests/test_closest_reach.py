@@ -6,6 +6,7 @@ from scipy.interpolate import NdBSpline
 from scipy.spatial import KDTree
 
 import jaxfit as jf
+from jaxfit._closest import _reach
 from jaxfit._closest._reach import Reach, number_of_samples
 from jaxfit._splines._pieces import make_axis
 
@@ -47,13 +48,25 @@ def feet_and_points(net, knots, order):
 @pytest.mark.parametrize("kind", ["thin fold", "bent", "scroll"])
 @pytest.mark.parametrize("order", [(3, 3), (4, 4), (6, 4)])
 @pytest.mark.parametrize("shape", [(7, 8), (12, 7), (40, 9)])
-def test_nothing_is_nearer_than_feet_below_the_reach(shape, order, kind):
+def test_nothing_is_nearer_than_feet_below_the_reach(monkeypatch, shape, order, kind):
+    monkeypatch.setattr(_reach, "POINTS_PER_SAMPLE", 0)  # as with so many feet that more neighbours pay
     net, knots = net_of(shape, order, kind)
     feet, distance, nearest = feet_and_points(net, knots, order)
     axes = [make_axis(t.astype(float), k) for t, k in zip(knots, order, strict=True)]
     below = Reach(net, *axes).exceeds(*feet.T, distance)
     assert 0.05 < below.mean() < 0.95
     assert not np.any(below & (nearest < 0.999 * distance))
+
+
+def test_more_neighbours_raise_the_reach_of_an_even_sheet_where_there_are_many_feet(monkeypatch):
+    knots = np.asarray(jf.clamped_uniform_knots(30, 4))
+    x, y = np.meshgrid(*2 * [np.linspace(0, 1, 30)], indexing="ij")
+    net, axis = np.stack([x, y, 0.02 * np.sin(6 * x)], axis=-1), make_axis(knots, 4)
+    u, v = np.random.default_rng(0).uniform(0.2, 0.8, (2, FEET))
+    distance = np.full(FEET, 0.06)
+    assert not Reach(net, axis, axis).exceeds(u, v, distance).any()
+    monkeypatch.setattr(_reach, "POINTS_PER_SAMPLE", 0)
+    assert Reach(net, axis, axis).exceeds(u, v, distance).all()
 
 
 def test_few_cells_have_many_samples_and_many_cells_one_each():

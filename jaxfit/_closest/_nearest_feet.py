@@ -21,15 +21,15 @@ from jaxfit._closest._chunks import (
 )
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
-from jaxfit._closest._reach import Reach, number_of_samples
+from jaxfit._closest._reach import POINTS_PER_SAMPLE, Reach, number_of_samples
 from jaxfit._closest._samples import sample
 from jaxfit._compile import compiled
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
 MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
-# The reach costs about as much as the search for so many points for each of its samples. Where cells are few
-# both cost little, and it spares searches that exchange feet for the same ones with other last digits.
-LEAST_POINTS_PER_SAMPLE, LEAST_POINTS_PER_CELL = 6, 24
+# Where cells are few the reach costs little, and it spares searches that exchange feet for the same ones with
+# other last digits.
+LEAST_POINTS_PER_CELL = 24
 SOME = 4  # points in a cell show whether there are nearer feet elsewhere
 MUCH_NEARER = 0.999  # of a squared distance
 
@@ -191,7 +191,7 @@ def _globally(projector: _Projector, known: Any, used: tuple[int, int], thorough
     # The reach is that of a surface in space whose tangent plane nowhere jumps.
     smooth = not (axes[0].creased or axes[1].creased) and axes[1].polynomials.shape[1] > 1
     cells = axes[0].cells * axes[1].cells
-    enough = min(LEAST_POINTS_PER_SAMPLE * number_of_samples(*axes), LEAST_POINTS_PER_CELL * cells)
+    enough = min(POINTS_PER_SAMPLE * number_of_samples(*axes), LEAST_POINTS_PER_CELL * cells)
     if smooth and net.shape[2] == 3 and len(points) >= enough:
         below = Reach(net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
         left = np.flatnonzero(~(below & best["converged"]))

@@ -12,6 +12,7 @@ safety: this is an estimate, not a proof.
 """
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,10 @@ from jaxfit._splines._pieces import Axis
 
 SAFETY = 0.3  # of the reach found over pairs of samples
 SHARE_OF_RADIUS = 0.5  # of the least radius of curvature, which is exact at samples
+# A sample with the fewest neighbours costs about as much as the search for so many points.
+POINTS_PER_SAMPLE = 6
 LEAST_INTERVALS = 16  # between samples along each direction; one a cell where there are more cells
-NEIGHBOURS = 33  # samples around one, itself included
+NEIGHBOURS = 33, 129  # samples around one, itself included; more where that proves enough other feet
 ADJACENT = 2  # samples so close along both parameters show the curvature
 # How far, in samples along each direction, two points of the surface may move against the samples beside.
 # In one plane it is 1/2, for each of the four samples around a foot has its pairs.
@@ -32,7 +35,7 @@ MOVE = 0.7
 OUTERMOST = 4  # of the neighbours
 ROUNDING = 1e-6  # of a squared length
 LEAF = 16  # samples
-BLOCK = 512  # samples
+BLOCK = 1 << 14  # samples times neighbours: so few that everything stays in the caches
 
 
 class Reach:
@@ -73,17 +76,30 @@ class Reach:
             _interval(axis, x, count - 1) for axis, x, count in zip(self.axes, (u, v), (a, b), strict=True)
         )
         place = row * (b - 1) + column
-        asked = np.zeros((a - 1) * (b - 1), bool)
-        asked[place] = True
-        number = np.flatnonzero(_around(asked.reshape(a - 1, b - 1), np.logical_or, False))
-        parts = [number[begin : begin + BLOCK] for begin in range(0, number.size, BLOCK)]
-        reach = np.full(a * b, np.inf)
-        reach[number] = np.concatenate(on_all_cores(self._reach_at, parts))
-        return distance <= _least_of_four(reach.reshape(a, b)).reshape(-1)[place]
+        below, left = np.zeros(place.size, bool), np.arange(place.size)
+        for count in NEIGHBOURS:
+            asked = np.zeros((a - 1, b - 1), bool)
+            asked.reshape(-1)[place[left]] = True
+            samples = np.flatnonzero(_around(asked, np.logical_or, False))
+            cost = POINTS_PER_SAMPLE * samples.size * count / NEIGHBOURS[0]
+            if count > NEIGHBOURS[0] and left.size <= cost:
+                break
+            reach, most = self._reach_between(samples, count)[:, place[left]]
+            below[left] = distance[left] <= reach
+            left = left[(distance[left] > reach) & (distance[left] <= most)]
+        return below
 
-    def _reach_at(self, number: np.ndarray) -> Float[np.ndarray, " samples"]:
-        """The reach at samples: so few that everything stays in the caches."""
-        count = min(NEIGHBOURS, self.tree.n)
+    def _reach_between(self, number: np.ndarray, count: int) -> Float[np.ndarray, "2 places"]:
+        """The least of `_reach_at` the four samples around each place, as far as these are asked for."""
+        step = max(1, BLOCK // count)
+        parts = [number[begin : begin + step] for begin in range(0, number.size, step)]
+        limits = np.full((2, math.prod(self.shape)), np.inf)
+        at_samples = partial(self._reach_at, count=min(count, self.tree.n))
+        limits[:, number] = np.concatenate(on_all_cores(at_samples, parts), axis=1)
+        return np.stack([_least_of_four(x.reshape(self.shape)).reshape(-1) for x in limits])
+
+    def _reach_at(self, number: np.ndarray, count: int) -> Float[np.ndarray, "2 samples"]:
+        """The reach at samples from `count` neighbours, and what more neighbours could raise it to."""
         away, beside = self.tree.query(self.points.T[number], count)
         away, beside = (np.ascontiguousarray(x.reshape(-1, count).T) for x in (away, beside))
         x = [p.take(beside[1:]) - p[number] for p in self.points]
@@ -102,13 +118,14 @@ class Reach:
         square = np.where(close, away[1:] ** 2, worst**2 + along2)
         height = np.hypot(np.where(close, height, worst), self._outward_part(number, s, t))
         tiny = np.finfo(away.dtype).tiny  # where samples coincide, the reach is zero
-        reach = np.min(square / (2 * np.maximum(height, np.sqrt(ROUNDING) * away[1:]) + tiny), axis=0)
+        pairs = np.min(square / (2 * np.maximum(height, np.sqrt(ROUNDING) * away[1:]) + tiny), axis=0)
+        reach = most = np.minimum(SAFETY * pairs, self.half_radius[number])
         if count < self.tree.n:
             # Of the samples that are not among these, the nearest are like the last ones that are.
             others = self.diagonal[beside[-OUTERMOST:]].max(axis=0)
             radius = away[-1] - 0.5 * (self.diagonal[number] + others)
-            reach = np.minimum(reach, 0.5 * np.maximum(radius, 0) / SAFETY)
-        return np.minimum(SAFETY * reach, self.half_radius[number])
+            reach = np.minimum(most, 0.5 * np.maximum(radius, 0))
+        return np.stack([reach, most])
 
     def _are_close(self, number: np.ndarray, beside: np.ndarray) -> Bool[np.ndarray, "neighbours samples"]:
         """Whether at most ADJACENT samples apart along u and along v."""
