@@ -36,6 +36,8 @@ def batch_command(args: argparse.Namespace) -> int:
 
 def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
     """A job for each file; refuses two that would write the same surface, before anything is done."""
+    for name in args.inputs:
+        _check_name(name)
     jobs = {job.row["input"]: job for job in (job_of(args, name) for name in args.inputs)}
     taken: dict[str, str] = {}
     for name, job in jobs.items():
@@ -55,6 +57,14 @@ def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
         raise io.InputError(f"the folder {folder} cannot be made: {error.strerror or error}.") from error
     io.check_output(folder / "table.npz")  # whether anything can be written there
     return list(jobs.values())
+
+
+def _check_name(name: str) -> None:
+    """Refuse what names no file: those that are missing or damaged get a row each."""
+    if Path(name).is_dir():
+        raise io.InputError(f"{name} is a folder; name the files in it, as in {Path(name) / '*'}.")
+    if set(name) & set("*?[") and not Path(name).exists():
+        raise io.InputError(f"{name} matches no file; check the folder and the pattern.")
 
 
 def _fit_all(args: argparse.Namespace, jobs: list[Job], table: Table) -> None:
@@ -89,4 +99,6 @@ def _summarise(rows: list[Row], before: int, table: Table) -> None:
     said = ", ".join(f"{count} {name}" for name, count in counts if count)
     retry = before and any(row["status"] == FAILED for row in rows)
     advice = "; --retry-failed fits the failed ones again" if retry else ""
-    print(f"{len(rows)} files ({before} done before): {said}; see {table.sheet}{advice}")
+    print(
+        f"{len(rows)} file{'s' * (len(rows) != 1)} ({before} done before): {said}; see {table.sheet}{advice}"
+    )

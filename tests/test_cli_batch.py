@@ -137,6 +137,8 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
         (["grid.npz", "--normals", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
         (["grid.npz", "--boundary", "other/grid.npz", "-o", "other"], "holds the file grid.npz"),
         (["a.npz", "-o", "a.npz"], "cannot be made"),
+        (["a.npz", "other", "-o", "out"], "other is a folder; name the files in it, as in other/*."),
+        (["a.npz", "none/*.npz", "-o", "out"], "none/*.npz matches no file"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
         (["a.npz", "--scheduler", "tcp://x"], 'pip install "jaxfit-surfaces[cluster]"'),

@@ -355,6 +355,11 @@ def test_the_reason_why_a_final_surface_misses_what_was_met():
         assert result_of(final_code(converged, errors, 2e-4, goal)) == result
     stopped = code_of(jf.RESULTS.max_steps_reached)
     assert final_code(stopped, (1.0, 1.0), 0.0, goal) == stopped
+    stalled = code_of(jf.RESULTS.stalled)
+    assert final_code(stalled, (1.0, 1.0), 1e-4, goal) == stalled
+    assert result_of(final_code(stalled, (1.0, 1.0), 2e-3, goal)) == jf.RESULTS.rounded
+    any_error = tolerances_of(0.0, None, 5)
+    assert final_code(stalled, (1.0, 1.0), 2e-3, any_error) == stalled
 
 
 def test_a_tolerance_out_of_reach_ends_as_stalled(base):

@@ -92,7 +92,7 @@ def test_throw_raises_whatever_is_made_of_the_fit():
         fit = jf.approximate(points, BASE, jf.GeometricApproximation(), **options)
         return fit.surface.control_points
 
-    with pytest.raises(Exception, match="did not converge"):
+    with pytest.raises(Exception, match="did not converge: the maximum number of iterations was reached"):
         jax.block_until_ready(jax.jit(net)(POINTS))
 
 

@@ -284,7 +284,12 @@ def test_errors_of_a_symmetric_fit_say_how_far_the_data_were_from_symmetric():
     moved = np.linalg.norm(np.asarray(fit.surface(fit.u, fit.v)) - noisy, axis=-1).max() / diagonal(noisy)
     np.testing.assert_allclose(moved, expected / 2, rtol=1e-6)
     assert "measured to the symmetrised grid" in fit.message
-    assert f"{moved:.2g}" in fit.message
+    assert f"{100 * moved:.2g} % of the diagonal" in fit.message
+    assert "other axis" not in fit.message
+    wrong = jf.interpolate(
+        noisy * [1, 1, 2] + 0.3 * noisy[::-1], jf.GeometricInterpolation(symmetry=jf.Reflection(axis=1))
+    )
+    assert "mirrored along the other axis" in wrong.message
     assert "symmetrised" not in jf.interpolate(noisy, max_steps=1).message
 
 

@@ -94,7 +94,7 @@ def test_control_points_that_rounding_takes_off_the_points_are_told():
     rounded = jf.approximate(far, jf.BSplineSurface(net, *knots), method, tol_average=1e-2)
     assert rounded.result == jf.RESULTS.rounded
     assert not rounded.converged
-    assert "until the control points were rounded" in rounded.message
+    assert "the rounding of the control points keeps the errors above" in rounded.message
     # Units in the last place of 1e6 are 1/16, so a control point is off by up to 1/32 in each coordinate.
     assert rounded.average_error > np.sqrt(3) / 32 / float(rounded.stats["diagonal"])
     exact = jf.BSplineSurface(net.astype(float), base.knots_u, base.knots_v)

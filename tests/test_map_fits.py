@@ -150,6 +150,9 @@ def test_inside_a_transformation_the_fits_are_one_program():
             fits[i].surface.control_points, alone.surface.control_points, rtol=0, atol=1e-10
         )
     assert [bool(jnp.isfinite(fit.average_error)) for fit in fits] == [True, False, True]
+    assert not bool(fits[1].converged)
+    assert jnp.isnan(fits[1].maximum_error)
+    np.testing.assert_array_equal(fits[1].surface.control_points, BASE.control_points)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,7 @@ def test_every_kind_of_source_gives_the_same_fit(base, streamed, tmp_path):
     cuts = [0, 1, 800, 800, 2900, 3000]
     sources = [
         path,
+        jax.device_put(POINTS),
         np.load(path, mmap_mode="r"),
         [POINTS[a:b] for a, b in itertools.pairwise(cuts)],
         lambda: (POINTS[k : k + 450] for k in range(0, 3000, 450)),
@@ -168,6 +169,11 @@ def test_bad_sources_are_refused_in_a_sentence(base, name):
     source, sentence = REFUSED[name]
     with pytest.raises(ValueError, match=sentence):
         jf.approximate_stream(source, base, block_size=BLOCK)
+
+
+def test_a_source_that_is_traced_is_refused(base):
+    with pytest.raises(TypeError, match=r"source must not be traced .* use approximate"):
+        jax.jit(lambda points: jf.approximate_stream(points, base).average_error)(POINTS)
 
 
 def test_a_source_that_can_be_read_only_once_is_refused(base):

@@ -128,6 +128,14 @@ def test_loops_are_turned_so_that_the_region_is_to_their_left():
     assert trimmed.holes == 1
 
 
+def test_rings_may_end_where_they_begin():
+    rings = [np.concatenate([loop, loop[:1]]) for loop in (SQUARE, HOLES[0])]
+    open_, closed = (jf.TrimmedSurface(wavy_surface(), x) for x in ((SQUARE, HOLES[0]), rings))
+    for loop, ring in zip(open_.loops, closed.loops, strict=True):
+        assert {tuple(x) for x in np.asarray(loop)} == {tuple(x) for x in np.asarray(ring)}
+        assert len(loop) == len(ring)
+
+
 def test_vertices_outside_by_rounding_are_moved_onto_the_border():
     trimmed = jf.TrimmedSurface(wavy_surface(), (SQUARE * (1 + 1e-12) - 5e-13,))
     assert (np.asarray(trimmed.loops[0]) == SQUARE).all()
@@ -140,9 +148,12 @@ def test_vertices_outside_by_rounding_are_moved_onto_the_border():
         ((SQUARE[:2],), "at least three vertices"),
         ((SQUARE * [1, np.nan],), "must be finite"),
         ((SQUARE * 1.1,), r"must lie in the domain .* \(1\.1, 0\)"),
-        ((np.concatenate([SQUARE, SQUARE[:1]]),), "vertices 4 and 0 are the same"),
-        ((SQUARE[[0, 1, 3, 2]],), "touch or cross itself"),
-        ((np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.1], [0.5, 0.9]]),), "touch or cross itself"),
+        ((SQUARE[[0, 1, 1, 2, 3]],), "vertices 1 and 2 are the same"),
+        ((SQUARE[[0, 1, 3, 2]],), r"touch or cross itself, but does near \(0\.5, 0\.5\)"),
+        (
+            (np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.1], [0.5, 0.9]]),),
+            r"itself, but does near \(0\.5, 0\.1\)",
+        ),
         ((np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.5]]) * [1, 0] + [0, 0.5],), "touch or cross itself"),
         ((L_SHAPE, circle(0.5, 0.5, 0.1)), "touch or cross each other"),
         ((L_SHAPE, circle(0.8, 0.8, 0.1)), r"loops\[1\] is not inside loops\[0\]"),

@@ -238,6 +238,8 @@ def fitted_surface(
     if moved.shape == base.control_points.shape:
         nu, nv = base.shape
         still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)[:nu, :nv]
+        if not concrete:  # there points that are not finite are found out only here
+            still |= ~jnp.all(jnp.isfinite(moved))
         moved = xp.where(still, xp.asarray(base.control_points), moved)
     parts = moved, xp.asarray(end.knots_u, dtype), xp.asarray(end.knots_v, dtype)
     return BSplineSurface(*(jax.device_put(parts) if concrete else parts))
@@ -292,7 +294,7 @@ def _fit(
     relative = relative if loss is None else relative + loss
     counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
     average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
-    maximum = xp.max(xp.where(counted, relative, 0.0))
+    maximum = xp.where(xp.isnan(average), average, xp.max(xp.where(counted, relative, 0.0)))
     arrays: Any = (u, v, relative, average, maximum)
     if concrete:
         stats = stats | _at_border(surface, cloud, (u, v), relative, counted)
@@ -322,13 +324,18 @@ def _at_border(surface: BSplineSurface, cloud: Any, feet: Any, errors: Any, coun
 
 def final_code(code: Any, errors: tuple[Any, Any], loss: Any, goal: Tolerances) -> Any:
     """`code`, unless the final surface misses tolerances that were met in the loop: by no more than the
-    `loss` to rounding, or because it has been polished.
+    `loss` to rounding, or because it has been polished; or unless the errors can't fall to a tolerance for
+    this loss.
     """
 
     def met(slack: Any) -> bool:
         limits = goal.average, goal.maximum
         return all(float(error) - slack <= limit for error, limit in zip(errors, limits, strict=True))
 
+    if int(code) == code_of(RESULTS.stalled) and any(
+        0.0 < limit < float(loss) for limit in (goal.average, goal.maximum)
+    ):
+        return np.int32(code_of(RESULTS.rounded))
     if int(code) != code_of(RESULTS.converged) or met(0.0):
         return code
     return np.int32(code_of(RESULTS.rounded if met(float(loss)) else RESULTS.stalled))

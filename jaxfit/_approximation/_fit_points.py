@@ -79,6 +79,8 @@ def fit_points(
         at least twice the order and at most 64 each way.
     order : (K, L) or int
         Degree + 1 along u and v (default (4, 4)), each 2 to 8; one number is that of both.
+    method : GeometricApproximation(), OrthogonalDistance(), StandardApproximation() or your own, optional
+        As for `approximate`.
     base : Coons(), Meshless() or DynamicBaseSurface(), optional
         How the base surface is made. Default: Coons(), or where that is farther than 0.5 % of the diagonal
         from the points on average, Meshless(), if it is nearer. Only with a boundary.
@@ -89,8 +91,6 @@ def fit_points(
         In the unit of the points: no triangle is longer, so gaps that are wider are holes. Only without a
         boundary. Default: twice the distance of the sixth neighbour, of 99 % of the points; given faces are
         all kept.
-    method : GeometricApproximation(), OrthogonalDistance(), StandardApproximation() or your own, optional
-        As for `approximate`.
     options
         As for `approximate`: tol_average (default 6e-4) and tol_maximum (default none), fractions of the
         diagonal: 6e-4 is 0.06 %; max_steps, weights, start, progress, throw, errors, adjoint. Without a

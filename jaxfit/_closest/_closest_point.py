@@ -112,8 +112,8 @@ def closest_point(
         Largest tangential part of the residual, as a fraction of the extent (the diagonal of the box
         around control points and queries). Default 1e-12 in float64, 1e-5 in float32.
     max_steps : int
-        At least 1. About as many evaluations are spent on a point, from each start and in each of the places
-        it is searched, before it counts as not converged.
+        At least 1: about how many evaluations of the surface a point gets from each of its starts. One that
+        needs more has not converged (default 60).
 
     Returns
     -------

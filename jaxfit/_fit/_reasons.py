@@ -24,8 +24,8 @@ class RESULTS(eqx.Enumeration):
         "or loosen the tolerances."
     )
     stalled = (
-        "the errors have stopped falling above the tolerances; loosen these, or try another method, for a "
-        "cloud also more control points or a better base surface."
+        "the errors have stopped falling above the tolerances; loosen these, or try another method or, of a "
+        "cloud, more control points or a better base surface."
     )
     noise_reached = (
         "finer nets bring the surface no nearer to points that were held out: what is left above the "
@@ -40,9 +40,8 @@ class RESULTS(eqx.Enumeration):
         "good surface if there was one; check the data and the base surface."
     )
     rounded = (
-        "the tolerance was met until the control points were rounded; loosen it, work in float64 (the flag "
-        "jax_enable_x64 of jax.config), or, if the data is far from the origin, subtract its "
-        "centre."
+        "the rounding of the control points keeps the errors above the tolerance; loosen it, work in float64 "
+        "(the flag jax_enable_x64 of jax.config) or, if the data is far from the origin, subtract its centre."
     )
     normals_missed = (
         "some normals lie in the surface through the points or on its other side, so that it would have to "

@@ -12,11 +12,13 @@ from jaxtyping import Bool, Float
 
 from jaxfit._checks import is_concrete
 from jaxfit._fit._history import History
-from jaxfit._fit._reasons import RESULTS
+from jaxfit._fit._reasons import RESULTS, result_of
 from jaxfit._fit._summary import describe, describe_briefly, said_reason
 from jaxfit._quality import Regularity, regularity
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
+
+MUCH_MOVED = 0.05  # of the diagonal, by symmetrising: more than what was measured is off
 
 
 @jax.tree_util.register_static
@@ -128,9 +130,10 @@ class Fit(eqx.Module):
         sentence = said_reason(self, sentences[self.result])
         moved = 0.5 * self.stats.get("asymmetry", 0.0)
         if is_concrete(moved) and np.ndim(moved) == 0 and moved > self.stats.get("tolerance", np.inf):
+            wrong = "; look whether it is mirrored along the other axis" if moved > MUCH_MOVED else ""
             return (
-                f"{sentence} Errors are measured to the symmetrised grid, whose points lie up "
-                f"to {float(moved):.2g} of the diagonal away from the given ones."
+                f"{sentence} Errors are measured to the symmetrised grid, whose points lie up to "
+                f"{100 * float(moved):.2g} % of the diagonal away from the given ones{wrong}."
             )
         return sentence
 
@@ -144,4 +147,6 @@ def converged_or_raise(fit: Fit) -> Fit:
         if not bool(fit.converged):
             raise RuntimeError(f"the fit did not converge: {fit.message}")
         return fit
-    return eqx.error_if(fit, fit.result != RESULTS.converged, "the fit did not converge.")
+    reasons: Any = RESULTS
+    sentences = [f"the fit did not converge: {reasons[result_of(x)]}" for x in range(len(reasons))]
+    return eqx.branched_error_if(fit, fit.result != RESULTS.converged, fit.result._value, sentences)

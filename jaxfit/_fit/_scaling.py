@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -85,7 +86,7 @@ class Outward(eqx.Module):
 
 
 def _like(centre: Any, x: Any) -> Any:
-    return jnp.asarray(centre, x.dtype).reshape((1,) * (x.ndim - 1) + (-1,))
+    return jnp.asarray(centre, jax.dtypes.canonicalize_dtype(x.dtype)).reshape((1,) * (x.ndim - 1) + (-1,))
 
 
 def unit_of(points: Any, name: str = "points") -> Unit:

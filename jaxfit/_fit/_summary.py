@@ -217,9 +217,10 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = with_sides(sentence, far)
     if missed and beyond <= MOST and not outliers and fit.stats.get("points_out_of_reach", 0) > 0:
         points = _said_points(int(fit.stats["points_out_of_reach"]))
+        finer = "" if fit.result == RESULTS.net_exhausted else "insert knots, or "
         sentence = (
-            f"{sentence} {points} out of reach of a surface of this net that does not fold; insert knots, or "
-            "look whether they lie on another sheet."
+            f"{sentence} {points} out of reach of a surface of this net that does not fold; {finer}look "
+            "whether they lie on another sheet."
         )
     if is_single(fit) and _has_surplus(fit):
         net, count = np.prod(fit.surface.shape), _points_that_count(fit)

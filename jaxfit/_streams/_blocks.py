@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -23,8 +24,12 @@ class Blocks:
     def __init__(self, source: Source, dimension: int, size: int):
         self.source, self.dimension, self.size = source, dimension, size
         self.count: int | None = None  # known once all have been read
+        if isinstance(source, jax.core.Tracer):
+            raise TypeError("source must not be traced by jit, vmap or grad; use approximate there.")
         if isinstance(source, (str, os.PathLike)):
             self.source = _mapped(source)
+        if isinstance(source, jax.Array):
+            self.source = np.asarray(source)
         if isinstance(self.source, np.ndarray):
             _check_shape(self.source, dimension)
         elif not callable(source) and (not isinstance(source, Iterable) or iter(source) is source):

@@ -56,10 +56,12 @@ def _name(i: int) -> str:
 
 def _in_the_domain(name: str, loop: Any, domain: Float[np.ndarray, "2 2"]) -> Loop:
     values = np.asarray(loop, float)
+    if values.ndim == 2 and len(values) > 1 and np.array_equal(values[0], values[-1]):
+        values = values[:-1]  # a ring as GeoJSON has it
     if values.ndim != 2 or values.shape[1] != 2 or len(values) < 3:
         raise ValueError(
             f"{name} must have shape (vertices, 2) with at least three vertices, but has shape "
-            f"{values.shape}; give the parameters (u, v) of a closed polyline, the first not repeated."
+            f"{values.shape}; give the parameters (u, v) of a closed polyline."
         )
     if not np.isfinite(values).all():
         raise ValueError(f"{name} must be finite, but holds NaN or infinity; remove those vertices.")
@@ -104,7 +106,7 @@ def check_simple(loops: Sequence[Loop]) -> None:
         return
     k = int(np.argmax(met))
     a, b = int(of_loop[i[k]]), int(of_loop[j[k]])
-    at = "({:.6g}, {:.6g})".format(*edges[i[k], 0])
+    at = "({:.6g}, {:.6g})".format(*_common_point(edges[i[k]], edges[j[k]]))
     if a == b:
         raise ValueError(
             f"{_name(a)} must not touch or cross itself, but does near {at}; resample or repair it."
@@ -134,6 +136,15 @@ def _meet(p: Edges, q: Edges) -> Bool[np.ndarray, " pairs"]:
         np.sign(_cross(s[:, 1] - s[:, 0], t[:, k] - s[:, 0])) for s, t in ((p, q), (q, p)) for k in (0, 1)
     ]
     return (sides[0] * sides[1] <= 0) & (sides[2] * sides[3] <= 0)
+
+
+def _common_point(p: Float[np.ndarray, "2 2"], q: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2"]:
+    """Where two segments that meet do so: of parallel ones where what they share begins."""
+    along, other = (np.diff(x, axis=0) for x in (p, q))
+    across = _cross(along, other)[0]
+    if across:
+        return p[0] + _cross(q[:1] - p[:1], other)[0] / across * along[0]
+    return sorted((*p, *q), key=lambda end: float(end @ along[0]))[1]
 
 
 def _fold_back(edges: Edges, i: Any, j: Any, following: Any) -> Bool[np.ndarray, " pairs"]:

@@ -27,8 +27,8 @@ class TrimmedSurface(eqx.Module):
     ----------
     surface : BSplineSurface
     loops : sequence of arrays (vertices, 2)
-        Closed polylines in (u, v), the first vertex not repeated at the end: the outer loop first, then the
-        holes. They are kept counter-clockwise and clockwise, whichever way they were given, so that the
+        Closed polylines in (u, v), with or without the first vertex at the end: the outer loop first, then
+        the holes. They are kept counter-clockwise and clockwise, whichever way they were given, so that the
         region is to the left of each. Vertices that lie outside the domain by rounding are moved onto it.
 
     Raises
