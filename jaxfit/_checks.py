@@ -112,6 +112,8 @@ def _as_wanted(name: str, shape: tuple[int, ...], ndim: int) -> str:
         return f"pass {name}.reshape(-1, {shape[2]}), or interpolate it if it is a grid of data"
     if len(shape) == 2 and ndim == 3 and name == "grid":
         return "reshape it to (n, m, d) if its points stand row by row, or fit them by fit_points as a cloud"
+    if len(shape) == 1 and ndim == 2 and name == "points":
+        return "give one row per point, a single one as points[None]"
     return "reshape it"
 
 

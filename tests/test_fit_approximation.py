@@ -240,7 +240,8 @@ def test_a_base_that_meets_the_tolerances_is_returned_and_said_to_be_it(base):
     grown = dataclasses.replace(fit, stats=fit.stats | {"growth_steps": 5})
     assert grown.message == "all tolerances are met."  # of a scan each net begins anew
     loops = jf.TrimmedSurface(fit.surface, (np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]),))
-    assert "smooth surface that the fit starts from" in dataclasses.replace(grown, trimmed=loops).message
+    trimmed = dataclasses.replace(grown, trimmed=loops)
+    assert "smooth surface that the fit of the last net starts from" in trimmed.message
     noisy = POINTS + 0.01 * np.random.default_rng(0).normal(size=POINTS.shape)
     rested = jf.approximate(noisy, base, tol_average=0.0)
     assert rested.result == jf.RESULTS.stalled

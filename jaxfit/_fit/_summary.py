@@ -201,7 +201,8 @@ def said_reason(fit: Any, sentence: str) -> str:
     missed = is_single(fit) and not bool(fit.converged)
     if is_single(fit) and _is_of_cloud(fit) and not missed and not _moves(fit):
         advice = "" if fit.folds else ", which is returned; lower the tolerances for a closer one"
-        first = "base surface" if fit.trimmed is None else "smooth surface that the fit starts from"
+        last = "fit of the last net" if int(fit.stats.get("growth_steps", 0)) else "fit"
+        first = "base surface" if fit.trimmed is None else f"smooth surface that the {last} starts from"
         sentence = f"{sentence.removesuffix('.')} by the {first}{advice}."
     if missed and _is_of_cloud(fit) and fit.result == RESULTS.stalled and not fit.stats["tol_average"]:
         sentence = "the errors have stopped falling."
