@@ -1,9 +1,12 @@
 """Which points of a scan are left out of the sheet, and why."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from jaxfit._cores import cores, on_all_cores
 
 NEIGHBOURS = 16
 PLANES = 4  # times the plane through the neighbours is laid; each time, those far from it count less
@@ -56,15 +59,12 @@ def _outliers(points: np.ndarray) -> tuple[Bool[np.ndarray, " points"], Bool[np.
     from scipy.spatial import cKDTree
 
     middle = points - points.mean(axis=0)
-    distance, near = cKDTree(middle).query(middle, NEIGHBOURS + 1)
+    distance, near = cKDTree(middle).query(middle, NEIGHBOURS + 1, workers=cores())
     near, reach = near[:, 1:], distance[:, NEIGHBOURS // 3 + 1]
-    blocks = np.split(near, range(BLOCK, len(near), BLOCK))
-    starts = range(0, len(near), BLOCK)
-    height = np.concatenate(
-        [_heights(middle[k : k + BLOCK], middle[x]) for k, x in zip(starts, blocks, strict=True)]
-    )
+    blocks = [slice(k, k + BLOCK) for k in range(0, len(near), BLOCK)]
+    height = np.concatenate(on_all_cores(lambda x: _heights(middle[x], middle[near[x]]), blocks))
     usual, most, spacing = (
-        np.concatenate([np.quantile(x[part], share, axis=1) for part in blocks])
+        np.concatenate(on_all_cores(partial(_quantiles, x, share, near), blocks))
         for x, share in ((height, 0.5), (height, 0.8), (reach, 0.5))
     )
     least = ROUNDING * np.linalg.norm(np.ptp(middle, axis=0))
@@ -72,6 +72,11 @@ def _outliers(points: np.ndarray) -> tuple[Bool[np.ndarray, " points"], Bool[np.
     far = reach > FAR * spacing + least
     strewn = (reach > STREWN * np.median(reach)) & (height > ALOFT * reach)
     return off | far & ((height > ALOFT * reach) | (reach > SPARSE * np.quantile(reach, COMMON))), strewn
+
+
+def _quantiles(x: np.ndarray, share: float, near: np.ndarray, part: slice) -> Float[np.ndarray, " points"]:
+    """Of the numbers `x` of the neighbours of some points."""
+    return np.quantile(x[near[part]], share, axis=1)
 
 
 def _heights(points: Float[Any, "points 3"], near: Float[Any, "points near 3"]) -> Float[Any, " points"]:
