@@ -155,6 +155,18 @@ def test_inside_a_transformation_the_fits_are_one_program():
     np.testing.assert_array_equal(fits[1].surface.control_points, BASE.control_points)
 
 
+def test_a_net_with_room_for_knots_keeps_its_base_where_a_cloud_is_not_finite():
+    method = jf.GeometricApproximation(insertion=jf.KnotInsertion())
+    points = np.where(np.arange(len(CLOUDS[0]))[:, None] == 3, np.nan, CLOUDS[0])
+    fit = jax.jit(lambda x: jf.approximate(x, BASE, method, max_steps=40))(points)
+    (nu, nv), net = BASE.shape, np.asarray(fit.surface.control_points)
+    assert net.shape != BASE.control_points.shape
+    assert np.isfinite(net).all()
+    np.testing.assert_array_equal(net[:nu, :nv], BASE.control_points)
+    np.testing.assert_allclose(fit.surface(0.3, 0.6), BASE(0.3, 0.6), atol=1e-12)
+    assert not bool(fit.converged)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

@@ -8,6 +8,7 @@ import pytest
 from helpers import diagonal, wavy_grid, wavy_surface
 
 import jaxfit as jf
+from jaxfit._trimmed._checked_loops import _common_point
 from jaxfit._trimmed._inside import inside_on_grid
 from jaxfit._trimmed._trimmed_surface import loop_edges
 
@@ -165,6 +166,14 @@ def test_loops_that_bound_no_region_are_refused(loops, said):
     with pytest.raises(ValueError, match=said) as caught:
         jf.TrimmedSurface(wavy_surface(), loops)
     assert str(caught.value).endswith(".")
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.1, 1.4, 9))
+def test_edges_that_lie_on_one_another_are_found_where_they_do(angle):
+    along, start = np.array([np.cos(angle), np.sin(angle)]), np.array([0.1, 0.1])
+    on_line = start + np.array([0.0, 0.3, 0.1, 0.5])[:, None] * along  # parallel but for rounding
+    at = _common_point(on_line[:2], on_line[2:]) - start
+    np.testing.assert_allclose(at, np.clip(at @ along, 0.1, 0.3) * along, atol=1e-12)
 
 
 def test_a_fit_tells_of_folds_only_inside_its_loops():

@@ -234,13 +234,16 @@ def fitted_surface(
         end = end.trimmed()
     dtype = base.control_points.dtype
     xp: Any = np if concrete else jnp  # NumPy compiles nothing
-    moved = xp.asarray(unit.outward(end.control_points), dtype)
-    if moved.shape == base.control_points.shape:
+    moved, given = xp.asarray(unit.outward(end.control_points), dtype), xp.asarray(base.control_points)
+    if moved.shape == given.shape:
         nu, nv = base.shape
         still = xp.asarray(end.control_points) == xp.asarray(begun.control_points)[:nu, :nv]
-        if not concrete:  # there points that are not finite are found out only here
-            still |= ~jnp.all(jnp.isfinite(moved))
-        moved = xp.where(still, xp.asarray(base.control_points), moved)
+        moved = xp.where(still, given, moved)
+    elif not concrete:
+        room = [(0, a - b) for a, b in zip(moved.shape, given.shape, strict=True)]
+        given = jnp.pad(given, room, mode="edge")
+    if not concrete:  # there points that are not finite are found out only here
+        moved = jnp.where(jnp.all(jnp.isfinite(moved)), moved, given)
     parts = moved, xp.asarray(end.knots_u, dtype), xp.asarray(end.knots_v, dtype)
     return BSplineSurface(*(jax.device_put(parts) if concrete else parts))
 

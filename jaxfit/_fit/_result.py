@@ -18,7 +18,7 @@ from jaxfit._quality import Regularity, regularity
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
 
-MUCH_MOVED = 0.05  # of the diagonal, by symmetrising: more than what was measured is off
+MUCH_MOVED = 0.05  # of the diagonal: grids that were measured are less asymmetric
 
 
 @jax.tree_util.register_static

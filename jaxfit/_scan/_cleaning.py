@@ -20,7 +20,7 @@ OFF_USUAL = 8.0  # times the median height of the neighbours over their own plan
 OFF_MOST = 4.0  # times what four in five of them stay below,
 OFF_SPACING = 0.4  # times the distance of neighbours: all three for a point off the plane of its neighbours
 ROUNDING = 1e-9  # of the diagonal: a height so small is none
-BLOCK = 1 << 15  # points at once
+BLOCK = 1 << 13  # points at once, on each core
 
 
 class Cleaned(NamedTuple):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 Loop = Float[np.ndarray, "_ 2"]
 Edges = Float[np.ndarray, "edges 2 2"]  # start and end of each
 
-_ROUNDING = 1e-9  # of the width of the domain, by which vertices may lie outside
+_ROUNDING = 1e-9  # of the width of the domain, by which vertices may lie outside; of 1, of a sine
 
 
 def checked_loops(loops: Sequence[Any], domain: Float[np.ndarray, "2 2"]) -> list[Loop]:
@@ -142,7 +142,7 @@ def _common_point(p: Float[np.ndarray, "2 2"], q: Float[np.ndarray, "2 2"]) -> F
     """Where two segments that meet do so: of parallel ones where what they share begins."""
     along, other = (np.diff(x, axis=0) for x in (p, q))
     across = _cross(along, other)[0]
-    if across:
+    if abs(across) > _ROUNDING * np.linalg.norm(along) * np.linalg.norm(other):
         return p[0] + _cross(q[:1] - p[:1], other)[0] / across * along[0]
     return sorted((*p, *q), key=lambda end: float(end @ along[0]))[1]
 
