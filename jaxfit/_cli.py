@@ -17,8 +17,9 @@ from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
 from jaxfit._cli_page import write_page
 from jaxfit._cli_report import as_sentence, print_table
-from jaxfit._cli_session import choose_precision, set_compile_cache, show_no_line, trace_quickly
+from jaxfit._cli_session import choose_precision, set_compile_cache, trace_quickly
 from jaxfit._fit._summary import facts
+from jaxfit._progress_line import show_nothing, write_log
 from jaxfit.io._output import PICTURES
 
 REACHED, NOT_REACHED, BAD_INPUT, FAILED = 0, 1, 2, 3
@@ -50,7 +51,9 @@ def _run(argv: Sequence[str] | None) -> int:
     try:
         args = argument_parser().parse_args(argv)
         if args.quiet or args.command == "batch":  # which says what is done
-            show_no_line()
+            show_nothing()
+        else:
+            write_log()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what matters is in the table; --float32 was asked for
             if args.command == "batch":

@@ -35,7 +35,7 @@ exit codes:
 
 environment:
   JAXFIT_CACHE_DIR  as --cache; empty or "off" is --no-cache
-  JAXFIT_PROGRESS   "off" shows no progress
+  JAXFIT_PROGRESS   "off" shows no progress: neither a line on a terminal nor one each minute in a log
 
 All errors are distances from the data to the surface, in % of the diagonal of the data's
 bounding box.

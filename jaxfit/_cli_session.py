@@ -8,7 +8,6 @@ import sys
 import jax
 
 from jaxfit._program_folder import VARIABLE, keep_programs
-from jaxfit._progress_line import OFF, SETTING
 
 
 def choose_precision(args: argparse.Namespace) -> None:
@@ -21,11 +20,6 @@ def trace_quickly() -> None:
     gc.freeze()  # what is imported stays
     gc.set_threshold(50_000, 20, 50)
     jax.config.update("jax_traceback_in_locations_limit", 0)
-
-
-def show_no_line() -> None:
-    """Have fits say nothing of what they are doing."""
-    os.environ[SETTING] = OFF
 
 
 def set_compile_cache(args: argparse.Namespace) -> None:

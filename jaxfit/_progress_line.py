@@ -1,6 +1,7 @@
 """A line that says what a fit is doing, shown where someone looks on and only once it takes long.
 
-It is drawn by a thread of its own on what the fitting thread notes down; no traced program knows of it.
+A log, as the command writes it, gets a line each minute. A thread of its own draws them of what the fitting
+thread notes down; no traced program knows of it.
 """
 
 import contextlib
@@ -17,10 +18,11 @@ from typing import Any
 from jaxfit._checks import is_concrete
 from jaxfit._interrupt import at_last
 
-SETTING = "JAXFIT_PROGRESS"  # "off" in the environment shows nothing
-OFF = "off"
+SETTING = "JAXFIT_PROGRESS"  # in the environment
+OFF, LOG = "off", "log"  # nothing anywhere; lines for a log where nobody looks on
 DELAY = 3.0  # seconds before the line appears
 INTERVAL = 0.25  # between two updates
+LOG_INTERVAL = 60.0  # before every line of a log
 COMPILER = "backend_compile"  # begins or is within the name of JAX's function that waits for XLA
 
 
@@ -36,12 +38,14 @@ class _Line:
         return f"jaxfit: {self.phase}{compiling}, {time.monotonic() - self.begun:.0f} s"
 
     def watch(self) -> None:
-        """Draw the line from DELAY seconds on until the end."""
-        if self.ended.wait(DELAY):
+        """Draw the line from DELAY seconds on until the end, or write one into a log now and then."""
+        seen = _looks_on()
+        delay, interval = (DELAY, INTERVAL) if seen else (LOG_INTERVAL, LOG_INTERVAL)
+        if self.ended.wait(delay):
             return
-        with _notebook() if _in_notebook() else _terminal() as draw:
+        with _log() if not seen else _notebook() if _in_notebook() else _terminal() as draw:
             draw(str(self))
-            while not self.ended.wait(INTERVAL):
+            while not self.ended.wait(interval):
                 draw(str(self))
 
 
@@ -95,9 +99,22 @@ def _line_of(phase: str) -> Iterator[None]:
         _one_line.release()
 
 
+def write_log() -> None:
+    """Have fits write lines for a log where nobody looks on, unless the environment says otherwise."""
+    os.environ[SETTING] = os.environ.get(SETTING) or LOG
+
+
+def show_nothing() -> None:
+    """Have fits say nothing of what they are doing."""
+    os.environ[SETTING] = OFF
+
+
 def _is_watched() -> bool:
-    if os.environ.get(SETTING, "").lower() == OFF or multiprocessing.parent_process():
-        return False
+    setting = os.environ.get(SETTING, "").lower()
+    return setting != OFF and not multiprocessing.parent_process() and (setting == LOG or _looks_on())
+
+
+def _looks_on() -> bool:
     return _in_notebook() or bool(getattr(sys.stderr, "isatty", bool)())
 
 
@@ -112,6 +129,15 @@ def _is_compiling(thread: int) -> bool:
     while frame is not None and COMPILER not in frame.f_code.co_name:
         frame = frame.f_back
     return frame is not None
+
+
+@contextlib.contextmanager
+def _log() -> Iterator[Callable[[str], None]]:
+    def write(text: str) -> None:
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+    yield write
 
 
 @contextlib.contextmanager

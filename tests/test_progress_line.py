@@ -77,6 +77,26 @@ def test_the_command_says_the_same(shown, monkeypatch, tmp_path):
     assert shown(_cli.main, [*argv, "--quiet"]) == ""
 
 
+def test_the_command_writes_a_line_now_and_then_into_a_log(shown, monkeypatch, tmp_path):
+    monkeypatch.setattr(_progress_line, "LOG_INTERVAL", 0.001)
+    monkeypatch.setenv(_progress_line.SETTING, "")
+    sides = {f"boundary_{side}": polyline for side, polyline in SIDES.items()}
+    np.savez(tmp_path / "cloud.npz", points=CLOUD, **sides)
+    argv = f"fit {tmp_path}/cloud.npz -o {tmp_path}/s.npz --no-picture --no-cache".split()
+    argv += "--net 6x6 --max-steps 2".split()
+    lines = shown(_cli.main, argv, stream=io.StringIO).splitlines()
+    assert len(lines) > 1
+    assert any("fitting 6 x 6 control points to 300 points" in line for line in lines)
+    assert not any("\x1b" in line for line in lines)
+    assert shown(_cli.main, [*argv, "--quiet"], stream=io.StringIO) == ""
+
+
+def test_a_short_fit_leaves_no_line_in_a_log(shown, monkeypatch):
+    monkeypatch.setenv(_progress_line.SETTING, "log")
+    assert shown(wait, stream=io.StringIO) == ""
+    assert "still waiting" in shown(wait)  # where a terminal looks on all is as before
+
+
 def test_a_net_chosen_by_some_of_the_points_says_of_how_many(monkeypatch):
     said = []
     monkeypatch.setattr(_cloud_fit, "doing", said.append)
