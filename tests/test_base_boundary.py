@@ -106,6 +106,18 @@ def test_a_side_that_the_shared_corners_shrink_to_a_point_is_refused():
         Boundary(**sides)
 
 
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_sides_on_one_line_are_refused_and_a_thin_strip_is_not(offset):
+    def side(a, b, rise=0.0):
+        place = np.linspace(a, b, 5)[:, None]
+        return offset + place * [1.0, 2.0, -0.5] + [0.0, rise, 0.0]
+
+    with pytest.raises(ValueError, match="v0, v1, u0 and u1 all lie on one line"):
+        Boundary(side(0, 0.4), side(0.6, 1), side(0, 0.6), side(0.4, 1))
+    strip = np.stack([side(0, 1), side(0, 1, 1e-6)], axis=1)
+    assert Boundary.from_grid(strip).v0.shape == (5, 3)
+
+
 def test_a_grid_of_one_row_is_refused():
     with pytest.raises(ValueError, match="at least 2 x 2"):
         Boundary.from_grid(np.ones((1, 5, 3)))

@@ -42,9 +42,9 @@ class Boundary(eqx.Module):
     ------
     ValueError
         For too few vertices, numbers that are not finite, masked entries, different d, a polyline of
-        length zero (patches with three sides are not supported), corners that do not meet, or a
-        tolerance that is negative or not finite. Inside `jit` only shapes are checked, and the
-        vertices are taken as they are.
+        length zero (patches with three sides are not supported), sides that all lie on one line, corners
+        that do not meet, or a tolerance that is negative or not finite. Inside `jit` only shapes are
+        checked, and the vertices are taken as they are.
     TypeError
         If the tolerance is no number, or the polylines are not real.
 
@@ -139,6 +139,7 @@ def _cleaned(lines: dict[str, np.ndarray], tolerance: Any) -> dict[str, np.ndarr
     for v, v_end, u, u_end in _CORNERS:
         lines[u][u_end] = lines[v][v_end]
     _check_lengths(lines, rounding)  # a side within the tolerance may have shrunk to a point
+    _check_area(lines, rounding)
     return {name: _without_repeats(line, 4 * eps * size) for name, line in lines.items()}
 
 
@@ -150,6 +151,20 @@ def _check_lengths(lines: dict[str, np.ndarray], rounding: float) -> None:
                 "the tip off or give a polyline of distinct points, and subtract what is common to large "
                 "coordinates or switch on jax_enable_x64."
             )
+
+
+def _check_area(lines: dict[str, np.ndarray], rounding: float) -> None:
+    """That the sides do not all lie on one line, in a space where they need not."""
+    vertices = np.concatenate(list(lines.values())).astype(float)
+    away = vertices - vertices[0]
+    far = away[np.argmax(np.linalg.norm(away, axis=1))]
+    along = far / np.linalg.norm(far)
+    beside = np.linalg.norm(away - (away @ along)[:, None] * along, axis=1).max()
+    if vertices.shape[1] > 1 and beside <= 2 * rounding:
+        raise ValueError(
+            f"v0, v1, u0 and u1 all lie on one line in {lines['v0'].dtype}; give the four sides of a patch, "
+            "and subtract what is common to large coordinates or switch on jax_enable_x64."
+        )
 
 
 def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
