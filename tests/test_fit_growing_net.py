@@ -67,6 +67,13 @@ def test_the_net_is_as_fine_as_the_tolerance_takes(grown):
     assert coarse.surface.shape == (8, 8)
 
 
+def test_parameter_lines_bent_by_coarser_nets_are_not_kept(grown):
+    anew = jf.fit_points(CLEAN, BOUNDARY, net=grown.surface.shape, tol_average=1e-4).regularity
+    found = grown.regularity
+    assert np.degrees(found.smallest_angle) > 60  # 27 where each fit goes on from the one before
+    assert found.curvature_energy < 1.1 * anew.curvature_energy
+
+
 def test_nets_of_one_stage_share_their_programs(grown_with_programs):
     """Compiling another for each net takes most of the time of a first fit."""
     grown, programs = grown_with_programs

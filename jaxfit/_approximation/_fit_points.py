@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,12 @@ from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._approximation._growing_net import NetGrowth, fit_growing
-from jaxfit._approximation._level_nets import FIRST_SIZE, BoundaryNets
+from jaxfit._approximation._level_nets import BoundaryNets
 from jaxfit._approximation._programs_ahead import programs_of_cloud_ahead
 from jaxfit._base import (
     AbstractBaseMethod,
     Boundary,
     Coons,
-    Meshless,
     base_surface,
     check_net_of_cloud,
     check_same_place,
@@ -138,10 +136,13 @@ def fit_points(
     that was held out comes no nearer to the surface, by 1.5 % of its average error, as the net gets finer:
     what is left is noise, and the net before is taken. Where errors of neighbours correlate by 0.5 or more,
     which those of noise do not, four finer nets are tried first. And it ends with two points for a control
-    point, without a boundary three; or with 200 control points each way, without a boundary 96. The last fit
-    is one to all points. Each net takes at most 20 iterations, the last up to `max_steps` where the
-    tolerances can be met. Of more than 20,000 points every second, third and so on choose it: 10,000
-    to 20,000 of them, or for finer nets at least 12 for each control point.
+    point, without a boundary three; or with 200 control points each way, without a boundary 96. With a
+    boundary the net that this ends with is also fitted from a base surface of its own, as if it had been
+    given: that fit is taken if it meets the tolerances as well, has no more folds and less curvature energy
+    (9), for what coarser nets cannot follow bends parameter lines. The last fit is one to all points. Each
+    net takes at most 20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than
+    20,000 points every second, third and so on choose it: 10,000 to 20,000 of them, or for finer nets at
+    least 12 for each control point.
 
     Without a boundary each point has its Delaunay star in its own tangent plane, and triangles on which
     stars agree make the mesh. It is laid out flat with little distortion and no flipped triangle (symmetric
@@ -202,11 +203,11 @@ def fit_points(
     if net is None and _may_grow(fixed, method, known):
         _check_no_derivative(cloud, method, options)
         request = _DEFAULTS | options | {"throw": False}
-        nets = BoundaryNets(boundary, order, np.asarray(cloud))
+        nets = BoundaryNets(boundary, order, np.asarray(cloud), base)
         growth = NetGrowth(nets.points, nets, default_method(method), request)
         growth.compile_ahead(order)
-        first = _base(boundary, nets.points, growth.net(FIRST_SIZE), order, base, lambda: nets.meshless)
-        fit = fit_growing(growth, first)
+        doing("making a base surface")
+        fit = fit_growing(growth)
     else:
         net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
         check_net_of_cloud(net, cloud.shape[0])
@@ -247,11 +248,10 @@ def _base(
     net: tuple[int, int],
     order: tuple[int, int],
     base: Any,
-    meshless: Callable[[], AbstractBaseMethod] = Meshless,
 ) -> Any:
     if base is None and is_concrete(cloud):
         doing("making a base surface")
-        return default_base(boundary, np.asarray(cloud), net, order, meshless)
+        return default_base(boundary, np.asarray(cloud), net, order)
     return base_surface(boundary, cloud, net=net, order=order, method=base)
 
 

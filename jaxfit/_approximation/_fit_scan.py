@@ -12,7 +12,7 @@ from jaxfit._approximation._checked_scan import ScanInput
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import GlobalFeet, LocalFeet
 from jaxfit._approximation._growing_net import NetGrowth, fit_everywhere, fit_growing
-from jaxfit._approximation._level_nets import FIRST_SIZE, SheetNets
+from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit
@@ -44,7 +44,7 @@ def fit_scan(
     cloud, nets, method = points[finite], SheetNets(sheet, order), default_method(method)
     if net is None and grows:
         growth = NetGrowth(cloud, nets, method, request, cleaned=True)
-        fit = fit_growing(growth, nets.base(growth.net(FIRST_SIZE)))
+        fit = fit_growing(growth)
         net = fit.surface.shape
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net

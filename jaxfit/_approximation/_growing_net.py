@@ -126,9 +126,10 @@ class NetGrowth:
         fit = partial(self.fit, self.points, size, base)
         return fit_everywhere(fit, request) if self.cleaned else fit(request)
 
-    def grown(self, base: BSplineSurface) -> tuple[Level, Any]:
+    def grown(self) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
         best, met, before, size, waited = None, None, None, FIRST_SIZE, 0
+        base = self.nets.base(self.net(size))
         while True:
             level = self._level(size, base, before, met is not None)
             if before is not None:
@@ -215,6 +216,21 @@ class NetGrowth:
         self.method = method
         return level
 
+    def afresh(self, level: Level) -> Level:
+        """The level, or one fitted to a base surface of the same net, if that does as well and bends less.
+
+        What coarser nets could not follow they have evened out by bending their parameter lines, and these
+        stay bent on finer nets.
+        """
+        if level.size == FIRST_SIZE or not self.nets.carries:
+            return level
+        other = self._level(level.size, self.nets.base(self.net(level.size)), None, False)
+        far = max(level.beside.farthest, self.far)
+        limit = np.inf if self._is_met(other) else 0.0 if self._is_met(level) else level.held_out / BETTER
+        if other.beside.farthest > far or other.held_out > limit:
+            return level
+        return min(level, other, key=bending)
+
     def _chosen(self, size: float) -> tuple[Int[np.ndarray, " some"], Bool[np.ndarray, " some"]]:
         """The points that a net of this size is fitted to, and which of them are held out."""
         most = ENOUGH
@@ -236,6 +252,12 @@ class NetGrowth:
         )
         factors = np.round(np.log(np.sqrt(excess)) / np.log(GROWTH))
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
+
+
+def bending(level: Level) -> tuple[int, float]:
+    """How often the surface of a level folds, and how much it bends."""
+    found = level.fit.regularity
+    return found.folds, found.thin_plate_energy if found.curvature_energy is None else found.curvature_energy
 
 
 def without_first_smoothing(method: Any) -> Any:
@@ -266,9 +288,10 @@ def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]
     return converged_or_raise(found) if throw else found
 
 
-def fit_growing(growth: NetGrowth, base: BSplineSurface) -> Fit:
+def fit_growing(growth: NetGrowth) -> Fit:
     """The fit with a net of the size that the tolerances take, or that the points allow."""
-    level, why = growth.grown(base)
+    level, why = growth.grown()
+    level = growth.afresh(level)
     size, request = level.size, growth.request | {"throw": False}
     if why != RESULTS.converged:
         request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])

@@ -9,12 +9,15 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base import (
+    AbstractBaseMethod,
     Boundary,
+    Coons,
     Meshless,
     MeshlessAt,
     base_surface,
     carried_base,
     cloud_of,
+    default_base,
     free_base,
     meshless_at,
     net_of_ratio,
@@ -38,14 +41,20 @@ Feet = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 class AbstractNets(ABC):
     """Nets of every size, and a surface taken from one to another.
 
-    `points_a_control_point` is the least number of points for each control point of any net.
+    `points_a_control_point` is the least number of points for each control point of any net. `carries` says
+    whether a surface that is carried keeps what a coarser net has made of its parameters.
     """
 
     points_a_control_point: ClassVar[float]
+    carries: ClassVar[bool]
 
     @abstractmethod
     def net(self, size: float, most: int) -> tuple[int, int]:
         """About `size` squared control points along u and v, at most `most` each way."""
+
+    @abstractmethod
+    def base(self, net: tuple[int, int]) -> BSplineSurface:
+        """The surface that fits on this net begin with."""
 
     @abstractmethod
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
@@ -65,10 +74,11 @@ class AbstractNets(ABC):
 class BoundaryNets(AbstractNets):
     """The sides are those of the boundary with every net."""
 
-    points_a_control_point = 2.0
+    points_a_control_point, carries = 2.0, True
     boundary: Boundary
     order: tuple[int, int]
     points: Float[np.ndarray, "points d"]
+    method: Coons | AbstractBaseMethod | None = None  # of the base surfaces
 
     def net(self, size: float, most: int) -> tuple[int, int]:
         """Shared between the directions by the lengths of the sides; more where the sides have waves, which
@@ -87,6 +97,12 @@ class BoundaryNets(AbstractNets):
         usual = net_of_size(FIRST_SIZE, self.boundary, self.order, SIDES_MOST)
         nu, nv = (n if n > MUCH * other else 0 for n, other in zip(least, usual, strict=True))
         return nu, nv
+
+    def base(self, net: tuple[int, int]) -> BSplineSurface:
+        """By the method, or the default one."""
+        if self.method is None:
+            return default_base(self.boundary, self.points, net, self.order, lambda: self.meshless)
+        return base_surface(self.boundary, self.points, net=net, order=self.order, method=self.method)
 
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """On the knots of the boundary curves, with these as sides."""
@@ -111,7 +127,7 @@ class BoundaryNets(AbstractNets):
 class SheetNets(AbstractNets):
     """Surfaces beyond the sheet on all sides, each at parameters made for it."""
 
-    points_a_control_point = 3.0  # some of these are where no points are
+    points_a_control_point, carries = 3.0, False  # some of these points are where no sheet is
     sheet: Sheet
     order: tuple[int, int]
 
