@@ -16,6 +16,7 @@ Scalar = float | np.ndarray | jax.Array
 
 LARGEST = 1e150
 LARGEST_COUNT = 2**31 - 2
+LEAST_ORDER, MOST_ORDER = 2, 8
 # Between which the coordinates of a cloud can choose, along its diagonal.
 LEAST_STEPS = {np.dtype(np.float64): 1e4, np.dtype(np.float32): 1e3}
 _INSTEAD = {  # of None
@@ -318,9 +319,9 @@ def checked_order(order: Any) -> tuple[int, int]:
     """`order` as a pair, whose numbers are equal where one is given; raises unless they are from 2 to 8."""
     pair = (order, order) if isinstance(order, (int, np.integer)) else order
     whole = isinstance(pair, (tuple, list)) and all(isinstance(k, (int, np.integer)) for k in pair)
-    if not whole or len(pair) != 2 or not all(2 <= k <= 8 for k in pair):
+    if not whole or len(pair) != 2 or not all(LEAST_ORDER <= k <= MOST_ORDER for k in pair):
         raise ValueError(
-            "order must be a whole number from 2 to 8, or a pair (K, L) of them, but is "
-            f"{order!r}; pass for instance 4 or (4, 3)."
+            f"order must be a whole number from {LEAST_ORDER} to {MOST_ORDER}, or a pair (K, L) of them, but "
+            f"is {order!r}; pass for instance 4 or (4, 3)."
         )
     return int(pair[0]), int(pair[1])

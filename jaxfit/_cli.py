@@ -92,25 +92,32 @@ def _fit_command(args: argparse.Namespace, started: float) -> int:
         threading.Thread(target=_load_matplotlib, daemon=True).start()
     done = FitOfFile(chosen, data).run()
     offset = io.write_surface(args.output, fitted_surface(done.fit))
-    if picture:
-        from jaxfit.plot import surface_and_errors
-
-        points = data.cloud if data.grid is None else data.grid
-        surface_and_errors(done.fit, points, path=picture, title=data.name)
     read_from = {"input": args.input, "points": _describe(data)}
-    took = time.perf_counter() - started
-    method = done.fit.stats.get("method", done.method)
-    outcome = {
-        "method": f"{method}, {'single' if args.float32 else 'double'} precision",
-        "time": f"fit {done.seconds:.2f} s, total {took:.2f} s",
-        "written": ", ".join(str(path) for path in (args.output, picture, args.report) if path),
-        **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),
-    }
-    if args.report:
-        write_page(args, data, done, read_from, outcome)
-    if not args.quiet:
-        said = {"tolerances": done.tolerances, "stopped": done.message}
-        print_table({**read_from, **facts(done.fit), **said, **outcome})
+    written = [args.output]
+
+    def outcome(*more: str) -> dict[str, str]:
+        method = done.fit.stats.get("method", done.method)
+        return {
+            "method": f"{method}, {'single' if args.float32 else 'double'} precision",
+            "time": f"fit {done.seconds:.2f} s, total {time.perf_counter() - started:.2f} s",
+            "written": ", ".join([*written, *more]),
+            **({"offset": " ".join(map(repr, offset.tolist()))} if offset.any() else {}),
+        }
+
+    try:
+        if picture:
+            from jaxfit.plot import surface_and_errors
+
+            points = data.cloud if data.grid is None else data.grid
+            surface_and_errors(done.fit, points, path=picture, title=data.name)
+            written.append(picture)
+        if args.report:
+            write_page(args, data, done, read_from, outcome(args.report))
+            written.append(args.report)
+    finally:  # the surface is there, whatever becomes of the others
+        if not args.quiet:
+            said = {"tolerances": done.tolerances, "stopped": done.message}
+            print_table({**read_from, **facts(done.fit), **said, **outcome()})
     return REACHED if done.reached else NOT_REACHED
 
 

@@ -6,6 +6,7 @@ import re
 from typing import Any, NoReturn
 
 from jaxfit import __version__
+from jaxfit._checks import LEAST_ORDER, MOST_ORDER
 from jaxfit._cli_methods import add_method_options
 from jaxfit.io import InputError
 
@@ -166,7 +167,13 @@ def _pair(text: str) -> tuple[int, int]:
 
 
 def _order(text: str) -> tuple[int, int]:
-    return (int(text), int(text)) if re.fullmatch(r"\d", text, re.ASCII) else _pair(text)
+    order = (int(text), int(text)) if re.fullmatch(r"\d{1,2}", text, re.ASCII) else _pair(text)
+    if not all(LEAST_ORDER <= k <= MOST_ORDER for k in order):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no order; pass {LEAST_ORDER} to {MOST_ORDER} along u and v, such as 4x3, or 4 for "
+            "both"
+        )
+    return order
 
 
 def _percent(text: str) -> float:
@@ -176,6 +183,8 @@ def _percent(text: str) -> float:
         value = math.nan
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no percentage such as 0.02")
+    if value > 100:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than 100 %, the diagonal; pass one such as 0.06")
     return value
 
 

@@ -22,7 +22,7 @@ from jaxfit._fit._summary import left_out
 from jaxfit._precision import bucket
 
 _FIT_OPTIONS = (
-    *"net order method grid boundary tol_average tol_maximum max_steps hole_length float32".split(),
+    *"net order method grid tol_average tol_maximum max_steps hole_length float32".split(),
     *METHOD_OPTIONS,
 )
 _FILES = ("boundary", "normals")

@@ -80,8 +80,9 @@ class FitOfFile:
         self.options = fit_options(args, self.method)
         self.boundary = None if interpolates(self.method) else _choose_boundary(args, data)
         if args.hole_length is not None and (self.boundary is not None or interpolates(self.method)):
+            has = "is a grid" if data.grid is not None else "has one"
             raise io.InputError(
-                f"--hole-length is for points without a boundary, but {args.input} has one; leave it out."
+                f"--hole-length is for points without a boundary, but {args.input} {has}; leave it out."
             )
         if args.base is not None and self.boundary is None and not interpolates(self.method):
             raise io.InputError(

@@ -36,7 +36,7 @@ _BASES: dict[str, Any] = {
     "dynamic": jaxfit.DynamicBaseSurface,
 }
 _ROWS = {"rows": 0, "columns": 1}
-_OF_CLOUDS = ("smoothing", "loss", "insertion", "border", "base")
+_OF_CLOUDS = ("smoothing", "loss", "insertion", "border", "base", "boundary")
 _OF_GRIDS = ("symmetry", "normals")
 OPTIONS = (*_OF_CLOUDS, *_OF_GRIDS)
 

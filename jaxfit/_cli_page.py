@@ -9,7 +9,7 @@ from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FittedFile
 from jaxfit._cli_methods import OPTIONS
 
-_SETTINGS = "method net order grid boundary hole_length tol_average tol_maximum max_steps float32".split()
+_SETTINGS = "method net order grid hole_length tol_average tol_maximum max_steps float32".split()
 
 
 def write_page(

@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import sys
 from collections.abc import Mapping
 
 # Options that sentences of the library name as in Python; not as a part of a file's name.
@@ -15,6 +16,7 @@ REWORDED = {  # what else they say in Python
     "work in float64 (the flag jax_enable_x64 of jax.config)": "leave out --float32",
     "switch on double precision, the flag jax_enable_x64 of jax.config": "leave out --float32",
     "switch on jax_enable_x64": "leave out --float32",
+    "loosen them, or pass a net.": "loosen them, or give a net by --net.",
 }
 
 
@@ -27,8 +29,8 @@ def as_sentence(error: object) -> str:
 
 
 def print_table(rows: Mapping[str, str]) -> None:
-    """Print names and values in two columns on stdout."""
-    if importlib.util.find_spec("rich") is None:
+    """Print names and values in two columns on stdout: whole lines where no terminal has a width."""
+    if importlib.util.find_spec("rich") is None or not sys.stdout.isatty():
         width = max(map(len, rows))
         for name, value in rows.items():
             print(f"{name:<{width}}  {value}")

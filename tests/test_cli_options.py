@@ -86,6 +86,7 @@ def names(folder):
         (["bare.xyz", "--boundary", "border.npz"], "fit_points"),
         (["bare.xyz"], "fit_points"),
         (["grid.npz", "--loss", "huber"], "fit_points"),
+        (["grid.npz", "--boundary", "border.npz"], "fit_points"),
         (["grid.npz", "--method", "interpolate-standard"], "interpolate"),
     ],
 )
@@ -253,6 +254,27 @@ def test_a_tolerance_that_was_missed_is_told(fits, folder, argv, code):
     assert (folder / "s.npz").is_file()
 
 
+def test_the_table_is_shown_although_the_picture_cannot_be_written(fits, folder, monkeypatch, capsys):
+    def fails(*_, **__):
+        raise OSError("s.png cannot be written: no space left on device.")
+
+    monkeypatch.setattr(plot, "surface_and_errors", fails)
+    assert _cli.main(["fit", "cloud.npz", "-o", "s.npz", "--report", "r.html"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.startswith("jaxfit: error: s.png cannot be written")
+    assert "average error" in captured.out
+    assert captured.out.splitlines()[-1].split() == ["written", "s.npz"]
+    assert (folder / "s.npz").is_file()
+
+
+def test_lines_of_the_table_are_whole_where_they_go_into_a_file(fits, folder, capsys):
+    fits.message = "The errors are within their tolerances, " + "and this goes on " * 20 + "to here."
+    assert run("cloud.npz") == 0
+    line = next(x for x in capsys.readouterr().out.splitlines() if x.startswith("stopped"))
+    assert line == line.rstrip()
+    assert line.endswith("to here.")
+
+
 def test_a_missing_extra_is_a_sentence(fits, folder, capsys):
     fits.fails = ImportError('points without a boundary need shapely; pip install "jaxfit-surfaces[scan]".')
     assert _cli.main(["fit", "cloud.npz", "-o", "out.npz"]) == 2
@@ -314,6 +336,15 @@ def test_interruption_writes_nothing(fits, folder, capsys):
         (["fit", "cloud.npz", "-o", "s.npz", "--net", "5"], "'5' is no pair of counts"),
         (["fit", "cloud.npz", "-o", "s.npz", "--tol-average", "-1"], "'-1' is no percentage"),
         (["fit", "cloud.npz", "-o", "s.npz", "--tol-maximum", "nan"], "'nan' is no percentage"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--tol-average", "101"], "'101' is more than 100 %"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--order", "9"], "'9' is no order; pass 2 to 8 along u and v"),
+        (["fit", "cloud.npz", "-o", "s.npz", "--order", "4x1"], "'4x1' is no order"),
+        (["fit", "grid.npz", "-o", "s.npz", "--boundary", "none.npz"], "none.npz does not exist"),
+        (
+            ["fit", "grid.npz", "-o", "s.npz", "--boundary", "border.npz", "--method", "interpolate"],
+            "--boundary is no option of --method interpolate; leave it out, or use --method approximate",
+        ),
+        (["fit", "grid.npz", "-o", "s.npz", "--hole-length", "1"], "a boundary, but grid.npz is a grid"),
         (["fit", "cloud.npz", "-o", "s.npz", "--max-steps", "0"], "'0' is no number of steps"),
         (["fit", "cloud.npz", "-o", "s.npz", "--method", "guess"], "'guess'"),
         (["fit", "cloud.npz", "-o", "s.npz", "--smoothing", "-1"], "'-1' is neither a number"),

@@ -1,5 +1,7 @@
 """Files of points are read exactly, and every bad one is named in one sentence."""
 
+import gzip
+
 import numpy as np
 import pytest
 from helpers import data, grid_edges, wavy_cloud, wavy_grid
@@ -283,10 +285,28 @@ def test_a_bad_boundary_is_refused(tmp_path):
         ("a.csv", "0,0,0\none,two,three\n", "line 2 has 'one' in place of a number"),
         ("a.xyz", "# nothing\n\n", "holds no points"),
         ("a.csv", "x,y,z\n", "holds no points"),
+        ("a.csv", "0,0,0\n1,0.5,1\n1,0,,1\n0,1,1\n", "line 3 has '' in place of a number"),
+        ("a.csv", "0,0,0\n1,0.5,1\n1,0.5,1,1\n0,1,1\n", "line 3 has 4 columns, but the first point has 3"),
     ],
 )
 def test_text_that_is_no_table(tmp_path, name, content, said):
     assert said in sentence(text(tmp_path / name, content))
+
+
+def test_numbers_may_stand_in_quotes_and_commas_before_blanks(tmp_path):
+    rows = [(0.5, 0, 0), (1, 1.5, 0), (0, 1, -2e3), (1, 0, 4)]
+    quoted = "".join(",".join(f'"{x}"' for x in row) + "\n" for row in rows)
+    np.testing.assert_array_equal(read_points(text(tmp_path / "a.csv", quoted)).points, rows)
+    labelled = "".join(f'{x},{y},{z},"{"a, b" if x else "c"}"\n' for x, y, z in rows)
+    np.testing.assert_array_equal(read_points(text(tmp_path / "b.csv", labelled)).points, rows)
+    spaced = "".join(", ".join(map(str, row)) + "\n" for row in rows)
+    for name in ("c.xyz", "c.txt", "c.csv"):
+        np.testing.assert_array_equal(read_points(text(tmp_path / name, spaced)).points, rows)
+
+
+def test_packed_text_is_to_be_unpacked(tmp_path):
+    (tmp_path / "a.csv").write_bytes(gzip.compress(b"0,0,0\n1,0,0\n0,1,0\n1,1,1\n"))
+    assert "a.csv is packed; unpack it" in sentence(tmp_path / "a.csv")
 
 
 # ----------------------------------------------------------------- the terrain

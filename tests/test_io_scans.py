@@ -1,5 +1,6 @@
 """Scanners' files and meshes are read exactly; what they mark as no measurement is left out and counted."""
 
+import struct
 import sys
 
 import numpy as np
@@ -216,6 +217,26 @@ def test_damaged_files_are_one_sentence(tmp_path, suffix, content, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_faces_may_have_different_numbers_of_corners(tmp_path, order):
+    need("trimesh", "plyfile")
+    corners = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 1, 0), (1, 1, 0), (2, 1, 0)]
+    kind = "binary_little_endian" if order == "<" else "binary_big_endian"
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    head = f"ply\nformat {kind} 1.0\nelement vertex 6\n{names}element face 3\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
+    faces = [(0, 1, 4, 3), (1, 2, 4), (2, 5, 4)]
+    body = b"".join(struct.pack(f"{order}3f", *corner) for corner in corners)
+    body += b"".join(struct.pack(f"{order}B{len(face)}i", len(face), *face) for face in faces)
+    (tmp_path / "a.ply").write_bytes(head.encode() + body)
+    read = read_points(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.points, corners)
+    assert sorted(map(tuple, read.faces.tolist())) == [(0, 1, 4), (0, 4, 3), (1, 2, 4), (2, 5, 4)]
+    (tmp_path / "a.ply").write_bytes(head.encode() + body[:-5])
+    with pytest.raises(InputError, match="was cut short"):
+        read_points(tmp_path / "a.ply")
+
+
 def test_files_that_were_cut_are_noticed(tmp_path):
     need("trimesh", "pypcd4")
     path = ply(tmp_path / "a.ply", POINTS, FACES, binary=True)
@@ -230,6 +251,10 @@ def test_files_that_were_cut_are_noticed(tmp_path):
     (tmp_path / "a.pcd").write_bytes(whole[:-24])
     with pytest.raises(InputError, match="claims 6 points, but holds 5"):
         read_points(tmp_path / "a.pcd")
+    path = stl(tmp_path / "a.stl", POINTS, FACES)
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"a\.stl holds no points, or was cut short; write it again"):
+        read_points(path)
 
 
 def without_last_lines(path, count):

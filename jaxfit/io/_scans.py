@@ -5,6 +5,7 @@ What a file itself marks as no measurement is left out and counted.
 
 import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,12 @@ def _pcd(path: Path, pypcd4: Any) -> Found:
 def _mesh(path: Path, trimesh: Any) -> Found:
     """The vertices of a mesh, each once, and its faces; all points of a file without faces."""
     options = {"process": False, "maintain_order": True, "skip_materials": True}
-    scene = trimesh.load_scene(str(path), **options)
+    try:
+        scene = trimesh.load_scene(str(path), **options)
+    except ValueError:
+        if path.suffix.lower() != ".ply":
+            raise
+        scene = trimesh.Scene(_mixed_ply(path, trimesh))
     pieces, corners, used = [np.empty((0, 3))], [np.empty((0, 3), int)], [np.empty(0, bool)]
     if path.suffix.lower() == ".off":
         _check_faces_of_off(path)
@@ -115,6 +121,8 @@ def _mesh(path: Path, trimesh: Any) -> Found:
         pieces.append(vertices)
         used.append(referenced)
     points, faces, in_face = (np.concatenate(x) for x in (pieces, corners, used))
+    if not len(points):
+        raise InputError(f"{path} holds no points, or was cut short; write it again.")
     finite = _finite(points)
     left_out = {"in no face": int((~in_face).sum()), "not finite": int((in_face & ~finite).sum())}
     kept = in_face & finite
@@ -126,6 +134,16 @@ def _mesh(path: Path, trimesh: Any) -> Found:
     number = np.where(single, np.cumsum(single) - 1, -1)[same[faces]]
     whole = (number >= 0).all(axis=1) & (np.diff(np.sort(number, axis=1), axis=1) > 0).all(axis=1)
     return points[single], left_out, number[whole]
+
+
+def _mixed_ply(path: Path, trimesh: Any) -> Any:
+    """The mesh of a file whose faces have different numbers of corners, which trimesh takes for damaged."""
+    data = import_extra("plyfile", ".ply", "scan").PlyData.read(str(path))
+    vertices = _columns(*(data["vertex"][axis] for axis in "xyz"))
+    names = ("vertex_indices", "vertex_index")
+    faces = next(data["face"][name] for name in names if name in data["face"])
+    fans = [[(face[0], *pair) for pair in pairwise(face[1:])] for face in faces]
+    return trimesh.Trimesh(vertices, [x for fan in fans for x in fan], process=False)
 
 
 def _first_of_equals(points: Points) -> Int[np.ndarray, " points"]:

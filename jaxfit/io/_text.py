@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxfit.io._point_data import MOST_COLUMNS, InputError
 
 FIRST = 0, 1, 2
+_PACKED = b"\x1f\x8b", b"PK"  # how files of gzip and zip begin
 _SAID = 8  # names of columns in a sentence
 _DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", None: "blanks"}
 _UNIT = r"(?:[_\s](?:[munkcdµμ]?m|in|ft)|\s*[/(\[#].*)?"  # of a name: x_mm, x mm, X [mm], X (mm), x/mm
@@ -28,7 +29,9 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} holds no plain text; save it as text in UTF-8.") from error
+        packed = path.read_bytes()[:2] in _PACKED
+        remedy = "is packed; unpack it" if packed else "holds no plain text; save it as text in UTF-8"
+        raise InputError(f"{path} {remedy}.") from error
     lines = [
         (number, line)
         for number, line in enumerate(text.splitlines(), start=1)
@@ -44,9 +47,12 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     named = _named_columns(path, names, found, title=delimiter is None and len(names) > found)
     columns = named or FIRST
     try:
-        values = np.loadtxt([line for _, line in lines], delimiter=delimiter, usecols=columns)
+        texts = [line for _, line in lines]
+        values = np.loadtxt(texts, delimiter=delimiter, usecols=columns, quotechar='"')
     except ValueError as error:
         raise InputError(_explain(path, lines, delimiter, columns)) from error
+    if delimiter is not None:
+        _check_columns(path, lines, delimiter)
     values = values.reshape(-1, 3)
     good = np.isfinite(values).all(axis=1)
     if not good.all():
@@ -64,6 +70,8 @@ def _delimiter(path: Path, first: str) -> str | None:
     """What separates the columns of the first point, None for blanks."""
     if ";" in first:
         return ";"
+    if re.fullmatch(r"\s*[^\s,]+(,\s+[^\s,]+)+,?\s*", first):  # before a blank it is no decimal comma
+        return ","
     if path.suffix.lower() != ".csv":
         return None
     return "\t" if "\t" in first and "," not in first else ","
@@ -129,6 +137,20 @@ def _check_commas(path: Path, lines: list[str], delimiter: str | None, named: in
         raise InputError(f"{path} seems to hold decimal commas ({lines[0].strip()}); {remedy}.")
 
 
+def _check_columns(path: Path, lines: list[tuple[int, str]], delimiter: str) -> None:
+    """Raise if a line has more columns than the first point: in which of them would x be?"""
+    most = lines[0][1].split("#")[0].count(delimiter)
+    for number, line in lines:
+        if line.count(delimiter) <= most or '"' in line:  # quotes may hold anything
+            continue
+        count = line.split("#")[0].count(delimiter)
+        if count > most:
+            raise InputError(
+                f"{path}: line {number} has {count + 1} columns, but the first point has {most + 1}; give "
+                "all points as many."
+            )
+
+
 def _check_first_column(path: Path, first: np.ndarray, columns: int) -> None:
     """Raise if the first of four or more columns only counts the points, from 0 or 1."""
     if columns >= 4 and len(first) >= 4 and first[0] in (0, 1) and (np.diff(first) == 1).all():
@@ -144,7 +166,7 @@ def _is_header(line: str) -> bool:
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        float(cell.strip().strip('"'))
     except ValueError:
         return False
     return True
