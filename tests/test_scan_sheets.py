@@ -229,6 +229,19 @@ def test_notches_are_filled_and_nothing_else():
     np.testing.assert_array_equal(manifold(fan, np.array([other, ear])), [*fan.tolist(), ear])
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.7])
+def test_the_sheet_reaches_both_ends_of_scan_lines(shift):
+    """Of 20 lines with 400 points each the ends would be lost where the mesh has one in twenty of these."""
+    x, y = np.meshgrid(np.linspace(0, 1, 400) + shift, np.linspace(0, 1, 20) + shift, indexing="ij")
+    sheet = sheet_of(np.stack([x, y, 0.1 * np.sin(4 * x) * np.cos(3 * y)], axis=-1).reshape(-1, 3))
+    nodes = sheet.nodes * sheet.size + sheet.centre - shift
+    assert len(nodes) < 2000
+    for line in np.linspace(0, 1, 20):
+        along = nodes[np.isclose(nodes[:, 1], line), 0]
+        assert along.min() < 0.01
+        assert along.max() > 0.99
+
+
 @pytest.mark.parametrize("lines", [14, 34])
 def test_scan_lines_with_few_points_across_make_one_sheet(lines):
     """Half a cylinder, 10 to 60 times as dense along lines as across them."""

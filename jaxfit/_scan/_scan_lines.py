@@ -15,6 +15,8 @@ NARROW = 0.35  # where their spread across it is so small a part of that along i
 # and the cloud is on lines where as many of its points are. Planes across its rim turn round a line first.
 NARROW_SHARE = 0.05
 ENOUGH = 2000  # points to tell
+# Points between two nodes are nearer to one than the BEYOND-fold of what MOST_BETWEEN of all points are.
+MOST_BETWEEN, BEYOND = 0.9, 1.2
 PART = 8  # neighbours are at most one in so many points, or they are no neighbours
 
 
@@ -28,7 +30,19 @@ def thinned_along_lines(points: Float[Any, "points 3"]) -> Float[Any, "nodes 3"]
         nodes = nodes[even_choice(nodes, len(nodes) // 2)]
         if len(nodes) <= PART * NEIGHBOURS[0]:
             return points
-    return nodes
+    return nodes if len(nodes) == len(points) else _to_the_ends(nodes, points)
+
+
+def _to_the_ends(nodes: Float[Any, "nodes 3"], points: Float[Any, "points 3"]) -> Float[Any, "more 3"]:
+    """With the farthest of the points that a node alone is near to, and not very: it is the last of a line,
+    and a rim through the nodes would cut the line off there.
+    """
+    from scipy.spatial import cKDTree
+
+    distance, nearest = cKDTree(nodes).query(points)
+    far = np.flatnonzero(distance > BEYOND * np.quantile(distance, MOST_BETWEEN))
+    far = far[np.lexsort((-distance[far], nearest[far]))]
+    return np.concatenate([nodes, points[far[np.unique(nearest[far], return_index=True)[1]]]])
 
 
 def on_lines(points: Float[Any, "points 3"]) -> bool:
