@@ -72,6 +72,18 @@ def compared(method):
     }
 
 
+def apart_on_a_large_net():
+    """Nets of some 1,600 control points and more are enough for LAPACK's threads to divide work."""
+    base, method = noisy_sheet(COUNT, (42, 42))[1], METHODS["orthogonal"]
+    options = OPTIONS | {"max_steps": 2}
+    points, weights = jf.shard_points(ALL, MESH)
+    fits = (
+        jf.approximate(points, base, method, weights=weights, **options),
+        jf.approximate(ALL, base, method, **options),
+    )
+    return apart(*(fit.surface.control_points for fit in fits))
+
+
 DIVIDED = jf.shard_points(ALL, MESH)[1]
 REFUSED = {
     "adjoint": dict(adjoint=jf.ImplicitAdjoint()),
@@ -112,6 +124,7 @@ def shared(method):
 def main():
     """Everything, as one line."""
     found = {name: compared(method) for name, method in METHODS.items()}
+    found["large"] = apart_on_a_large_net()
     found["refused"] = {name: refusal(options) for name, options in REFUSED.items()}
     clouds = ALL[: CLOUDS * 300].reshape(CLOUDS, 300, 3)
     where = jax.sharding.NamedSharding(MESH, jax.sharding.PartitionSpec("points"))

@@ -43,6 +43,10 @@ def test_points_on_eight_devices_have_the_fit_of_one(eight, name):
         assert found[part] < 1e-10, part
 
 
+def test_a_large_net_on_eight_devices_comes_to_an_end(eight):
+    assert eight["large"] < 1e-10
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_only_sums_of_the_size_of_the_net_go_between_devices(eight, name):
     sent = eight[name]["sent"]

@@ -213,7 +213,7 @@ def test_no_net_grows_where_most_points_lie_beyond_a_border_that_is_held(monkeyp
         return found, level
 
     held, level = growth(jf.OrthogonalDistance())
-    assert held.grown(level.fit.surface) == (level, jf.RESULTS.stalled)
+    assert held.grown() == (level, jf.RESULTS.stalled)
     free, level = growth(jf.OrthogonalDistance(border=jf.FreeBorder()))
     assert not free._reaches_beyond(level)
 

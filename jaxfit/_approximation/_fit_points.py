@@ -205,7 +205,7 @@ def fit_points(
         request = _DEFAULTS | options | {"throw": False}
         nets = BoundaryNets(boundary, order, np.asarray(cloud), base)
         growth = NetGrowth(nets.points, nets, default_method(method), request)
-        growth.compile_ahead(order)
+        growth.compile_ahead()
         doing("making a base surface")
         fit = fit_growing(growth)
     else:

@@ -28,6 +28,8 @@ MOST_SIZE = 200  # control points along either direction
 # From one net to the next the size grows by a factor or, far from the tolerance, by its square: sizes are
 # those of one ladder, so that clouds that differ little get the same net.
 GROWTH, MOST_FACTORS = 1.2, 2
+# What the size has to grow by in the end is at least this power of how many times too large an error is.
+SIZE_OF_EXCESS = 0.6
 BETTER = 0.985  # what the held-out error has to fall to, as a multiple of that with a coarser net
 # Where it does not, but the errors of neighbours are so much alike that they are no noise, so many finer nets
 # are tried all the same: waves that a net is too coarse for take several to be found.
@@ -107,12 +109,18 @@ class NetGrowth:
         nu, nv = (max(n, -(-most // MULTIPLE) * MULTIPLE) for n, most in largest)
         return Room((nu, nv), self.request["max_steps"], len(self.points), self.chunk)
 
-    def compile_ahead(self, order: tuple[int, int]) -> None:
-        """Begin to compile the fit of the first net."""
-        net, (some, _) = self.net(FIRST_SIZE), self._chosen(FIRST_SIZE)
+    def compile_ahead(self, size: float = FIRST_SIZE) -> None:
+        """Begin to compile the fit of a net of this size."""
+        net, (some, _) = self.net(size), self._chosen(size)
         request = self.request | {"max_steps": min(LEVEL_STEPS, self.request["max_steps"])}
-        room = self._room(FIRST_SIZE, net)
-        programs_of_cloud_ahead(self.method, self.points[some], net, order, request, room)
+        room = self._room(size, net)
+        programs_of_cloud_ahead(self.method, self.points[some], net, self.nets.order, request, room)
+
+    def _next_stage_ahead(self, level: Level) -> None:
+        """Begin to compile what fits all nets of the next stage, if the errors say that one is needed."""
+        most, beyond = self._stage(level.size), level.size * self._excess(level) ** SIZE_OF_EXCESS
+        if most in STAGES[:-1] and beyond > most and self.allows(GROWTH * most):
+            self.compile_ahead(GROWTH * most)
 
     def fit(self, points: Any, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
         """The fit of `points`, in a program for all nets of the stage and for any number of iterations."""
@@ -149,6 +157,7 @@ class NetGrowth:
                 return best, RESULTS.noise_reached
             else:
                 waited += 1
+            self._next_stage_ahead(level)
             coarser, size = size, size * self._growth(level)
             if not self.allows(size) or self.net(size) == self.net(coarser):
                 return best, RESULTS.net_exhausted if met is None else RESULTS.converged
@@ -240,17 +249,20 @@ class NetGrowth:
         some = self.sorted[:: -(-len(self.sorted) // most)]
         return some, np.arange(len(some)) % HELD_OUT == HELD_OUT // 2
 
-    def _growth(self, level: Level) -> float:
-        """How many times finer the next net is: errors fall about with the square of the size."""
+    def _excess(self, level: Level) -> float:
+        """How many times too large the errors are, infinite where nothing is small enough."""
         far = self.far if self._is_met(level) else None
         goals = self.request["tol_average"], self.request["tol_maximum"], far
         errors = float(level.fit.average_error), float(level.fit.maximum_error), level.beside.farthest
-        excess = max(
+        return max(
             error / goal if goal else np.inf
             for error, goal in zip(errors, goals, strict=True)
             if goal is not None
         )
-        factors = np.round(np.log(np.sqrt(excess)) / np.log(GROWTH))
+
+    def _growth(self, level: Level) -> float:
+        """How many times finer the next net is: errors fall about with the square of the size."""
+        factors = np.round(np.log(np.sqrt(self._excess(level))) / np.log(GROWTH))
         return float(GROWTH ** np.clip(factors, 1, MOST_FACTORS))
 
 

@@ -47,6 +47,7 @@ class AbstractNets(ABC):
 
     points_a_control_point: ClassVar[float]
     carries: ClassVar[bool]
+    order: tuple[int, int]
 
     @abstractmethod
     def net(self, size: float, most: int) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """A preconditioner for coupled normal matrices: an uncoupled factor in rotated frames."""
 
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 from typing import Any
 
@@ -51,8 +51,11 @@ def coupled_preconditioner(
     diagonal = jnp.where(free, uncoupled.diagonal, 1.0)[:, :, None, None]
     blocks = matrix.blocks / diagonal
     unit = jnp.eye(blocks.shape[-1], dtype=diagonal.dtype)
-    values, vectors = jnp.linalg.eigh(
-        jnp.where(free[:, :, None, None], blocks, unit[None, None]), symmetrize_input=False
+    # A row at a time: LAPACK's threads divide some 1,500 small matrices among themselves, and two fits at
+    # once, as on two devices, then wait for each other's for ever.
+    values, vectors = lax.map(
+        partial(jnp.linalg.eigh, symmetrize_input=False),
+        jnp.where(free[:, :, None, None], blocks, unit[None, None]),
     )
     scaled = vectors * lax.rsqrt(jnp.maximum(values, LEAST_SHARE))[:, :, None, :]
     roots = jnp.einsum("ijab,ijcb->acij", scaled, vectors, precision="highest")
