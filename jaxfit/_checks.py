@@ -315,6 +315,14 @@ def check_steps(name: str, value: Any) -> None:
     check_number(name, value, 0, whole=True)
 
 
+def with_whole_steps(options: dict[str, Any]) -> dict[str, Any]:
+    """The options, `max_steps` as an int where it is a whole number of some other type, for it is hashed."""
+    steps: Any = options.get("max_steps")
+    if not is_concrete(steps) or np.ndim(steps) or not np.issubdtype(np.asarray(steps).dtype, np.integer):
+        return options
+    return options | {"max_steps": int(steps)}
+
+
 def checked_order(order: Any) -> tuple[int, int]:
     """`order` as a pair, whose numbers are equal where one is given; raises unless they are from 2 to 8."""
     pair = (order, order) if isinstance(order, (int, np.integer)) else order

@@ -77,6 +77,20 @@ def test_different_knots_are_refused():
         coons_surface(v0, v1, u0.insert_knots([0.5]), u1)
 
 
+def test_curves_that_cannot_be_sides_are_refused():
+    v0, v1, u0, u1 = sides(helpers.wavy_net(NU, NV), *knots())
+    with pytest.raises(TypeError, match="v0 must be an object such as BSplineCurve"):
+        coons_surface(np.asarray(v0.control_points), v1, u0, u1)
+    with pytest.raises(TypeError, match="abscissae must be an object such as Greville"):
+        coons_surface(v0, v1, u0, u1, "greville")
+    flat = BSplineCurve(u1.control_points[:, :2], u1.knots)
+    with pytest.raises(ValueError, match="u1 lies in 2 dimensions and v0 in 3"):
+        coons_surface(v0, v1, u0, flat)
+    off = BSplineCurve(u0.control_points + 5.0, u0.knots)
+    with pytest.raises(ValueError, match=r"v\d and u0 must share a corner, but their ends are 8\.66 apart"):
+        coons_surface(v0, v1, off, u1)
+
+
 def test_derivatives_with_respect_to_points_and_knots_equal_differences():
     @jax.jit  # traced knots may be moved off their clamped ends
     def value(net, knots_u, knots_v):

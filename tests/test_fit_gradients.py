@@ -1,5 +1,6 @@
 """Derivatives of fits of clouds, beside central differences of the public call."""
 
+import warnings
 from functools import partial
 
 import jax
@@ -236,6 +237,32 @@ def test_a_cloud_with_its_boundary_is_differentiable_in_its_points_and_weights()
         np.testing.assert_allclose(jnp.sum(gradient[place] * direction), difference, rtol=1e-6, atol=1e-9)
     with pytest.raises(TypeError, match="net must be given"):
         jax.grad(lambda x: jf.fit_points(x, boundary).average_error)(np.tile(POINTS, (3, 1)))
+
+
+@pytest.mark.parametrize("transformation", [jax.grad, jax.jit])
+def test_a_boundary_that_is_traced_is_refused_in_a_sentence(transformation):
+    def error(sides):
+        return jf.fit_points(POINTS, jf.Boundary(**sides), net=(6, 7)).average_error
+
+    with pytest.raises(TypeError, match=r"boundary must be concrete, but is traced; .* coons_surface"):
+        transformation(error)({side: jnp.asarray(x) for side, x in EDGES.items()})
+
+
+@pytest.mark.slow
+@pytest.mark.float32_too
+def test_in_single_precision_the_fit_is_polished_to_rounding():
+    points, weights = (jnp.asarray(x, float) for x in (POINTS, WEIGHTS))
+    base, method = base_of((6, 7), (4, 4)), jf.StandardApproximation(smoothing=1e-4)
+
+    def height(points, adjoint):
+        fit = jf.approximate(points, base, method, tol_average=1e-3, weights=weights, adjoint=adjoint)
+        return jnp.sum(fit.surface(*PLACES) * FACTORS)
+
+    found = jax.grad(height)(points, jf.ImplicitAdjoint())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # there is no rounding that is small enough for this one
+        exact = jax.grad(height)(points, AT_ROUNDING)
+    assert jnp.linalg.norm(found - exact) < 2e-3 * jnp.linalg.norm(exact)
 
 
 def test_raw_scans_refuse_to_be_differentiated_before_they_are_meshed(monkeypatch):

@@ -43,7 +43,11 @@ def test_ragged_clouds_are_fitted_as_one_by_one(method):
 def test_a_cloud_that_is_not_finite_fails_alone():
     bad = np.array(CLOUDS[1])
     bad[7, 2] = np.nan
-    fits = jf.map_fits([CLOUDS[0], bad, CLOUDS[2]], BASE, **OPTIONS)
+    endless = jf.map_fits([bad * np.inf, CLOUDS[2]], BASE, **OPTIONS)
+    assert [bool(np.isfinite(fit.average_error)) for fit in endless] == [False, True]
+    fits = jf.map_fits(
+        [CLOUDS[0], bad, CLOUDS[2]], BASE, **{**OPTIONS, "max_steps": jnp.asarray(OPTIONS["max_steps"])}
+    )
     alone = jf.map_fits(CLOUDS, BASE, **OPTIONS)
     assert_same((fits[0], fits[2]), (alone[0], alone[2]))
     said = "1 point is NaN or infinite, so nothing was fitted; remove or repair them."
@@ -211,6 +215,12 @@ def test_names_and_sizes_get_a_sentence():
         jf.pad_clouds([])
     with pytest.raises(ValueError, match="weights must hold one number for each point"):
         jf.pad_clouds(CLOUDS, CLOUDS)
+    weights = [np.ones(len(cloud)) for cloud in CLOUDS]
+    for i, wrong, said in ((0, -1.0, "must not be negative"), (2, np.nan, "must be finite")):
+        with pytest.raises(ValueError, match=rf"weights\[{i}\] {said}"):
+            jf.pad_clouds(CLOUDS, [np.where(i == k, wrong, x) for k, x in enumerate(weights)])
+    with pytest.raises(ValueError, match=r"clouds\[1\] is no array \(points, d\) of numbers"):
+        jf.pad_clouds([CLOUDS[0], [[0, 1], [2]]])
     with pytest.raises(ValueError, match="see pad_clouds"):
         jax.jit(lambda cloud: jf.map_fits([cloud, CLOUDS[1]], BASE)[0].average_error)(CLOUDS[0])
     with pytest.raises(ValueError, match="workers must be a whole number of at least 1, but is 0"):

@@ -152,6 +152,15 @@ def test_files_that_cannot_be_used_are_refused(base, tmp_path):
         ValueError, match=r"source must be the path of a \.npy file, but .*points\.npz is none"
     ):
         jf.approximate_stream(archive, base)
+    with pytest.raises(OSError, match=r"feet_file .*feet\.npy cannot be written: No such file"):
+        jf.approximate_stream(path, base, feet_file=tmp_path / "none" / "feet.npy")
+    with pytest.raises(OSError, match=r"source .* cannot be read: Is a directory"):
+        jf.approximate_stream(tmp_path, base)
+    whole = path.read_bytes()
+    for cut in (100, len(whole) - 40):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(ValueError, match=r"source cannot be mapped, for .*points\.npy was cut short"):
+            jf.approximate_stream(path, base)
 
 
 REFUSED = {

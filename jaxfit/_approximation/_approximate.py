@@ -9,7 +9,7 @@ from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._approximation._orthogonal import OrthogonalDistance
 from jaxfit._approximation._sharded_fit import fit_sharded_cloud
 from jaxfit._approximation._shards import divided_over
-from jaxfit._checks import eager_where_concrete
+from jaxfit._checks import eager_where_concrete, with_whole_steps
 from jaxfit._fit._adjoints import AbstractAdjoint
 from jaxfit._fit._loop import Progress
 from jaxfit._fit._method import AbstractIterativeMethod
@@ -140,7 +140,7 @@ def approximate(
     }
     points = getattr(points, "cloud", points)
     fit = fit_cloud if divided_over(points) is None else fit_sharded_cloud
-    return fit(points, base, default_method(method), request)
+    return fit(points, base, default_method(method), with_whole_steps(request))
 
 
 def default_method(method: AbstractIterativeMethod | None) -> AbstractIterativeMethod:

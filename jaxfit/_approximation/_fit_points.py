@@ -21,6 +21,7 @@ from jaxfit._base import (
     Boundary,
     Coons,
     base_surface,
+    check_concrete,
     check_net_of_cloud,
     check_same_place,
     checked_boundary,
@@ -35,6 +36,7 @@ from jaxfit._checks import (
     checked_order,
     eager_where_concrete,
     is_concrete,
+    with_whole_steps,
     without_derivatives,
 )
 from jaxfit._fit._method import AbstractIterativeMethod
@@ -183,6 +185,7 @@ def fit_points(
     if boundary is None and not isinstance(points, Boundary):
         return _without_boundary(points, faces, hole_length, net, order, method, base, options)
     boundary = checked_boundary(boundary, points)
+    check_concrete(boundary)
     check_kind("base", base, (Coons, AbstractBaseMethod, type(None)), "Coons() or Meshless()")
     for name, value in (("faces", faces), ("hole_length", hole_length)):
         if value is not None:
@@ -191,6 +194,7 @@ def fit_points(
                 "either."
             )
     cloud = as_points("points", points, boundary.v0.shape[1], least=LEAST_POINTS)
+    options = with_whole_steps(options)
     fixed, known = without_derivatives((cloud, options))
     if not is_concrete(fixed):
         raise TypeError(

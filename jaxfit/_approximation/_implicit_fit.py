@@ -131,18 +131,18 @@ def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
     """
     if not is_concrete(stationarity):
         return
-    found, goal = float(np.max(np.asarray(stationarity))), adjoint.goal(np.asarray(stationarity).dtype)
-    if not found <= max(TRUSTED, goal):
+    found, good = float(np.max(np.asarray(stationarity))), adjoint.good(np.asarray(stationarity).dtype)
+    if not found <= max(TRUSTED, good):
         raise ArithmeticError(
             f"the fit has no derivative here: after up to {adjoint.polish_steps} Newton steps its surface is "
-            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, goal):.0e}); fit by "
+            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, good):.0e}); fit by "
             "OrthogonalDistance with a number as smoothing, take fewer control points, or pass "
             "ImplicitAdjoint(polish_steps=...) with more steps or UnrolledAdjoint()."
         )
-    if found > max(RELIABLE, goal):
+    if found > max(RELIABLE, good):
         warnings.warn(
             "the derivative may be far off: the surface is not quite at rest (stationarity "
-            f"{found:.1e}, more than {max(RELIABLE, goal):.0e}). Compare it with a difference, or fit "
+            f"{found:.1e}, more than {max(RELIABLE, good):.0e}). Compare it with a difference, or fit "
             "by OrthogonalDistance with a number as smoothing.",
             stacklevel=2,
         )

@@ -4,6 +4,7 @@ from jaxfit._base._base_method import AbstractBaseMethod as AbstractBaseMethod
 from jaxfit._base._base_method import Coons as Coons
 from jaxfit._base._base_surface import base_surface as base_surface
 from jaxfit._base._boundary import Boundary as Boundary
+from jaxfit._base._boundary import check_concrete as check_concrete
 from jaxfit._base._boundary import checked_boundary as checked_boundary
 from jaxfit._base._carried_base import carried_base as carried_base
 from jaxfit._base._coons import AbstractAbscissae as AbstractAbscissae

@@ -4,7 +4,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._base._base_method import AbstractBaseMethod, Coons
-from jaxfit._base._boundary import Boundary, centre_and_size, checked_boundary, farthest
+from jaxfit._base._boundary import Boundary, centre_and_size, check_concrete, checked_boundary, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
 from jaxfit._base._default_net import checked_net, default_net
@@ -180,11 +180,7 @@ def _checked_net(
     order: tuple[int, int],
     tolerance: float,
 ) -> tuple[int, int] | None:
-    if not is_concrete(boundary):
-        raise TypeError(
-            "boundary must be concrete, but is traced; call base_surface outside jit, or blend its curves by "
-            "coons_surface, which may be traced and differentiated."
-        )
+    check_concrete(boundary)
     check_number("tolerance", tolerance, 0.0)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")

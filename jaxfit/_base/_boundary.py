@@ -14,7 +14,7 @@ from jaxfit._checks import as_floating, as_points, check_kind, check_number, is_
 JOINABLE = 0.01  # of the diagonal: ends so close are meant to meet, as those of curves that were measured
 
 # The two ends that meet in each corner: (v-polyline, its end, u-polyline, its end), end 0 or -1.
-_CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
+CORNERS = (("v0", 0, "u0", 0), ("v0", -1, "u1", 0), ("v1", 0, "u0", -1), ("v1", -1, "u1", -1))
 
 
 class Boundary(eqx.Module):
@@ -108,6 +108,15 @@ def checked_boundary(boundary: Any, points: Any) -> Boundary:
     return boundary
 
 
+def check_concrete(boundary: Boundary) -> None:
+    """Raise where values of a boundary are not known yet."""
+    if not is_concrete(boundary):
+        raise TypeError(
+            "boundary must be concrete, but is traced; call base_surface outside jit, or blend its curves by "
+            "coons_surface, which may be traced and differentiated."
+        )
+
+
 def diagonal(*sets: np.ndarray) -> float:
     """Bounding-box diagonal of all the points together."""
     return float(np.linalg.norm(np.ptp(np.concatenate(sets).astype(float), axis=0)))
@@ -136,7 +145,7 @@ def _cleaned(lines: dict[str, np.ndarray], tolerance: Any) -> dict[str, np.ndarr
     rounding, size = 4 * eps * magnitude, diagonal(*lines.values())
     _check_lengths(lines, rounding)
     _check_corners(lines, max(tolerance * size, rounding), size)
-    for v, v_end, u, u_end in _CORNERS:
+    for v, v_end, u, u_end in CORNERS:
         lines[u][u_end] = lines[v][v_end]
     _check_lengths(lines, rounding)  # a side within the tolerance may have shrunk to a point
     _check_area(lines, rounding)
@@ -176,17 +185,18 @@ def _without_repeats(line: np.ndarray, least: float) -> np.ndarray:
     return kept
 
 
-def _corner_gaps(lines: dict[str, np.ndarray]) -> list[float]:
-    ends = [lines[v][v_end].astype(float) - lines[u][u_end].astype(float) for v, v_end, u, u_end in _CORNERS]
+def corner_gaps(lines: dict[str, np.ndarray]) -> list[float]:
+    """How far apart the ends are that are to meet, in the order of CORNERS."""
+    ends = [lines[v][v_end].astype(float) - lines[u][u_end].astype(float) for v, v_end, u, u_end in CORNERS]
     return [float(np.linalg.norm(x)) for x in ends]
 
 
 def _check_corners(lines: dict[str, np.ndarray], allowed: float, size: float) -> None:
-    gaps = _corner_gaps(lines)
+    gaps = corner_gaps(lines)
     worst = int(np.argmax(gaps))
     if gaps[worst] <= allowed:
         return
-    v, v_end, u, u_end = _CORNERS[worst]
+    v, v_end, u, u_end = CORNERS[worst]
     raise ValueError(
         f"boundary corners do not meet: the {'start' if v_end == 0 else 'end'} of {v} and the "
         f"{'start' if u_end == 0 else 'end'} of {u} are {gaps[worst]:.3g} apart "
@@ -210,6 +220,6 @@ def _to_reverse(lines: dict[str, np.ndarray], allowed: float) -> list[str] | Non
     """Which sides have to be reversed for the corners to meet, the fewest; None if that does not help."""
     for flips in sorted(product((1, -1), repeat=4), reverse=True):
         turned = {name: x[::flip] for (name, x), flip in zip(lines.items(), flips, strict=True)}
-        if max(_corner_gaps(turned)) <= allowed:
+        if max(corner_gaps(turned)) <= allowed:
             return [name for name, flip in zip(lines, flips, strict=True) if flip < 0]
     return None

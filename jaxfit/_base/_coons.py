@@ -1,13 +1,15 @@
 """Bilinear Coons blend of boundary control points (paper equations (6)-(7))."""
 
 from abc import abstractmethod
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit._checks import is_concrete
+from jaxfit._base._boundary import CORNERS, JOINABLE, corner_gaps, diagonal
+from jaxfit._checks import check_kind, is_concrete
 from jaxfit._compile import compiled
 from jaxfit._splines import BSplineCurve, BSplineSurface, greville_abscissae
 
@@ -58,11 +60,11 @@ GREVILLE = Greville()
 
 
 def coons_surface(
-    v0: BSplineCurve,
-    v1: BSplineCurve,
-    u0: BSplineCurve,
-    u1: BSplineCurve,
-    abscissae: AbstractAbscissae = GREVILLE,
+    v0: Any,
+    v1: Any,
+    u0: Any,
+    u1: Any,
+    abscissae: Any = GREVILLE,
 ) -> BSplineSurface:
     r"""The Coons surface of four B-spline curves, opposite ones on equal knots.
 
@@ -88,7 +90,10 @@ def coons_surface(
     Raises
     ------
     ValueError
-        If two opposite curves have different knots. Values are compared only outside `jit`.
+        If two opposite curves have different knots, curves lie in different spaces, or their ends are farther
+        apart than 1 % of the diagonal. Values are compared only outside `jit`.
+    TypeError
+        If one is no curve.
 
     Examples
     --------
@@ -99,6 +104,8 @@ def coons_surface(
     >>> surface(0.5, 0.5).tolist()
     [0.5, 0.5, 0.25]
     """
+    check_kind("abscissae", abscissae, AbstractAbscissae, "Greville() or Uniform()")
+    _check_curves({"v0": v0, "v1": v1, "u0": u0, "u1": u1})
     for (name_a, a), (name_b, b) in ((("v0", v0), ("v1", v1)), (("u0", u0), ("u1", u1))):
         same = a.knots.shape == b.knots.shape and a.order == b.order
         if same and is_concrete(a.knots, b.knots):
@@ -110,6 +117,26 @@ def coons_surface(
             )
     controls = tuple(curve.control_points for curve in (v0, v1, u0, u1))
     return BSplineSurface(coons_net(controls, v0.knots, u0.knots, abscissae), v0.knots, u0.knots)
+
+
+def _check_curves(curves: dict[str, Any]) -> None:
+    """That these are curves in one space, whose ends meet as far as they are known."""
+    for name, curve in curves.items():
+        check_kind(name, curve, BSplineCurve, "BSplineCurve(control_points, knots)")
+        d, first = curve.control_points.shape[1], curves["v0"].control_points.shape[1]
+        if d != first:
+            raise ValueError(f"{name} lies in {d} dimensions and v0 in {first}; give four curves in one.")
+    if not is_concrete(curves):
+        return
+    ends = {name: np.asarray(curve.control_points)[[0, -1]] for name, curve in curves.items()}
+    gaps, size = corner_gaps(ends), diagonal(*(np.asarray(x.control_points) for x in curves.values()))
+    worst = int(np.argmax(gaps))
+    if gaps[worst] > JOINABLE * size:
+        v, _, u, _ = CORNERS[worst]
+        raise ValueError(
+            f"{v} and {u} must share a corner, but their ends are {gaps[worst]:.3g} apart "
+            f"({100 * gaps[worst] / size:.3g} % of the diagonal); give curves that meet."
+        )
 
 
 @compiled

@@ -14,7 +14,7 @@ from jaxfit._approximation._checked_arguments import check_options, checked_requ
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._batch._broadcast import Request, one_by_one, requests_of
 from jaxfit._batch._failed_fit import failed_fit
-from jaxfit._checks import as_points, is_concrete
+from jaxfit._checks import as_points, is_concrete, with_whole_steps
 from jaxfit._cores import cores
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit, converged_or_raise
@@ -87,6 +87,7 @@ def map_fits(
     >>> [len(fit.u) for fit in fits], bool(fits[2].converged)
     ([60, 30, 60], False)
     """
+    options = with_whole_steps(options)
     requests = requests_of(clouds, base, method, weights)
     _check_names(options)
     if not is_concrete(requests, options):
@@ -159,7 +160,7 @@ def _check(index: int, request: Request, options: dict[str, Any]) -> None:
     """Raise the sentence of `approximate`, with the number of the cloud, for anything but a NaN in it."""
     try:
         check_options(request.method, progress=None, throw=False, **{**_OPTIONS, **options})
-        numbers = request.cloud if _is_finite(request) else np.nan_to_num(request.cloud)
+        numbers = request.cloud if _is_finite(request) else np.zeros_like(request.cloud)
         cloud = as_points("points", numbers, request.base.dimension, least=LEAST_POINTS)
         if _is_finite(request):
             checked_request(cloud, request.base.domain, weights=request.weights)

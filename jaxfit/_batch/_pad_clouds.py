@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from jaxfit._checks import as_points, is_concrete
+from jaxfit._checks import as_floating, as_points, is_concrete
 from jaxfit._precision import bucket
 
 
@@ -32,7 +32,7 @@ class PaddedClouds(NamedTuple):
     weights: Float[Any, "clouds most"]
 
 
-def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None = None) -> PaddedClouds:
+def pad_clouds(clouds: Sequence[Any], weights: Sequence[ArrayLike] | None = None) -> PaddedClouds:
     """Clouds of different sizes in one array, for `jax.vmap`, `jax.lax.map` and sharding.
 
     The padding repeats the last point of a cloud and has the weight 0. A fit with these weights leaves it out
@@ -72,7 +72,7 @@ def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None 
     >>> points.shape, weights.sum(axis=1).tolist()
     ((2, 96, 3), [90.0, 70.0])
     """
-    arrays = [_as_cloud(cloud, i) for i, cloud in enumerate(clouds)]
+    arrays = [_as_cloud(getattr(cloud, "cloud", cloud), i) for i, cloud in enumerate(clouds)]
     if not arrays:
         raise ValueError("clouds must hold at least one cloud, but is empty; give more.")
     if len({x.shape[1] for x in arrays}) > 1:
@@ -86,6 +86,7 @@ def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None 
             "weights must hold one number for each point of each cloud, but their shapes are "
             f"{[np.shape(w) for w in given][:5]}; give an array (points,) for each cloud."
         )
+    _check_weights(given)
     xp: Any = np if is_concrete(arrays, given) else jnp
     most = bucket(max(len(x) for x in arrays))
     points = [xp.concatenate([x, xp.repeat(x[-1:], most - len(x), axis=0)]) for x in arrays]
@@ -96,7 +97,17 @@ def pad_clouds(clouds: Sequence[ArrayLike], weights: Sequence[ArrayLike] | None 
 
 def _as_cloud(cloud: Any, index: int) -> Any:
     """The cloud as an array (points, d); its numbers need not be finite."""
-    array = cloud if hasattr(cloud, "dtype") else np.asarray(cloud, float)
-    shape = np.zeros(array.shape) if is_concrete(array) else array
-    as_points(f"clouds[{index}]", shape, None)
-    return array
+    try:
+        array = cloud if hasattr(cloud, "dtype") else np.asarray(cloud, float)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"clouds[{index}] is no array (points, d) of numbers; give one.") from error
+    concrete = is_concrete(array)
+    as_points(f"clouds[{index}]", np.zeros(array.shape, array.dtype) if concrete else array, None)
+    return array if np.issubdtype(array.dtype, np.floating) else array.astype(float)
+
+
+def _check_weights(weights: list[Any]) -> None:
+    """Raise unless those that are known are numbers from 0 on."""
+    for i, own in enumerate(weights):
+        if is_concrete(own) and not np.all(as_floating(f"weights[{i}]", own, 1) >= 0):
+            raise ValueError(f"weights[{i}] must not be negative; give 0 for points that are to be left out.")

@@ -10,6 +10,8 @@ from jaxfit._checks import check_number
 
 # Moves after which feet that are never held count as converged.
 CONVERGED_AFTER = 200
+# In single precision a residual of rounding times what is good in double leaves a per cent of a derivative.
+SINGLE, TO_ROUNDING = 1e-10, 1e-2
 
 
 class AbstractAdjoint(eqx.Module):
@@ -109,8 +111,9 @@ class ImplicitAdjoint(AbstractAdjoint):
     Parameters
     ----------
     residual : float
-        Polishing ends at this relative residual of G, or at rounding (default 1e-12; in single precision
-        times the ratio of the rounding units).
+        Polishing ends at this relative residual of G (default 1e-12), or at rounding, as always in single
+        precision. Where that is too far from rest, outside `jit`, there is a warning: above 1e-6, in single
+        precision above the residual times the ratio of the rounding units (5e-4).
     polish_steps : int
         The largest number of Newton steps (default 100; most fits need less than 20). Where they are rejected
         they are damped. 0 leaves the surface as it is. Approximation only.
@@ -145,6 +148,9 @@ class ImplicitAdjoint(AbstractAdjoint):
         return
 
     def goal(self, dtype: Any) -> float:
-        """The residual to reach in this precision."""
-        eps = float(jnp.finfo(dtype).eps)
-        return float(self.residual) * eps / float(jnp.finfo(jnp.float64).eps)
+        """The residual to polish to in this precision: where it is single, to rounding."""
+        return self.good(dtype) * (1.0 if jnp.finfo(dtype).eps < SINGLE else TO_ROUNDING)
+
+    def good(self, dtype: Any) -> float:
+        """The residual that is good enough in this precision."""
+        return float(self.residual) * float(jnp.finfo(dtype).eps) / float(jnp.finfo(jnp.float64).eps)

@@ -78,12 +78,20 @@ def _mapped(path: str | os.PathLike[str]) -> np.ndarray:
             np.lib.format.read_magic(file)
     except FileNotFoundError as error:
         raise FileNotFoundError(said_missing(path)) from error
+    except OSError as error:
+        raise OSError(f"source {os.fspath(path)} cannot be read: {error.strerror or error}.") from error
     except ValueError as error:
         raise ValueError(
             f"source must be the path of a .npy file, but {os.fspath(path)} is none; save the points by "
             "np.save, or pass a function that returns an iterator of arrays."
         ) from error
-    return np.load(path, mmap_mode="r")
+    try:
+        return np.load(path, mmap_mode="r")
+    except (ValueError, EOFError) as error:
+        raise ValueError(
+            f"source cannot be mapped, for {os.fspath(path)} was cut short or holds no plain numbers; save "
+            "the points by np.save again."
+        ) from error
 
 
 def _check_shape(source: np.ndarray, dimension: int) -> None:

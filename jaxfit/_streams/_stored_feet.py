@@ -27,7 +27,12 @@ class StoredFeet:
         if file is None:
             self.rows = np.empty(shape, np.float32)
         else:
-            self.rows = np.lib.format.open_memmap(file, "w+", np.float32, shape)
+            try:
+                self.rows = np.lib.format.open_memmap(file, "w+", np.float32, shape)
+            except OSError as error:
+                raise OSError(
+                    f"feet_file {os.fspath(file)} cannot be written: {error.strerror or error}."
+                ) from error
         self._words = self.rows.view(np.uint32)
         self._low, self._high = np.asarray(domain, np.float64).T[..., None]
 
