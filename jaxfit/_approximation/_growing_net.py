@@ -234,9 +234,10 @@ class NetGrowth:
         if level.size == FIRST_SIZE or not self.nets.carries:
             return level
         other = self._level(level.size, self.nets.base(self.net(level.size)), None, False)
-        far = max(level.beside.farthest, self.far)
-        limit = np.inf if self._is_met(other) else 0.0 if self._is_met(level) else level.held_out / BETTER
-        if other.beside.farthest > far or other.held_out > limit:
+        as_near = self._is_met(other) or (
+            not self._is_met(level) and other.held_out <= level.held_out / BETTER
+        )
+        if not as_near or other.beside.farthest > max(level.beside.farthest, self.far):
             return level
         return min(level, other, key=bending)
 

@@ -15,7 +15,7 @@ NARROW = 0.35  # where their spread across it is so small a part of that along i
 # and the cloud is on lines where as many of its points are. Planes across its rim turn round a line first.
 NARROW_SHARE = 0.05
 ENOUGH = 2000  # points to tell
-# Points between two nodes are nearer to one than the BEYOND-fold of what MOST_BETWEEN of all points are.
+# Points between nodes are nearer to one than BEYOND times what MOST_BETWEEN of all points are.
 MOST_BETWEEN, BEYOND = 0.9, 1.2
 PART = 8  # neighbours are at most one in so many points, or they are no neighbours
 
@@ -34,8 +34,8 @@ def thinned_along_lines(points: Float[Any, "points 3"]) -> Float[Any, "nodes 3"]
 
 
 def _to_the_ends(nodes: Float[Any, "nodes 3"], points: Float[Any, "points 3"]) -> Float[Any, "more 3"]:
-    """With the farthest of the points that a node alone is near to, and not very: it is the last of a line,
-    and a rim through the nodes would cut the line off there.
+    """With the last point of every line that the nodes stop short of, which a rim through them would cut off:
+    of the points that are far from every node, the farthest of those that one node is nearest to.
     """
     from scipy.spatial import cKDTree
 
