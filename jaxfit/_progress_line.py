@@ -66,7 +66,10 @@ def shows_progress(phase: str) -> Callable[[Callable[..., Any]], Callable[..., A
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(function)
         def shown(*args: Any, **options: Any) -> Any:
-            if options.get("progress") is not None or not _is_watched() or not is_concrete(args, options):
+            if options.get("progress") is not None or not _is_watched():
+                return function(*args, **options)
+            # What can be read only once is no tree, and its function says so.
+            if not is_concrete(*(x for x in (*args, *options.values()) if not isinstance(x, Iterator))):
                 return function(*args, **options)
             with _line_of(phase):
                 return function(*args, **options)

@@ -495,7 +495,7 @@ def folder(tmp_path, monkeypatch):
         (["-o", "t.npz", "--picture", "none/p.png"], "does not exist; make it first"),
         (["-o", "t.npz", "--max-steps", "2147483646"], "at most 1,000,000"),
         (["-o", "t.npz", "--max-steps", "9" * 5000], "at most 1,000,000"),
-        (["-o", "t.npz", "--order", "9x4"], "order must be"),
+        (["-o", "t.npz", "--order", "9x4"], "'9x4' is no order"),
         (["-o", "t.npz", "--cache", "c", "--no-cache"], "not allowed with"),
     ],
 )

@@ -57,6 +57,7 @@ def test_the_line_follows_the_work_and_goes(shown):
     text = shown(wait)
     assert text.index("jaxfit: waiting, 0 s") < text.index("jaxfit: still waiting, 0 s")
     assert text.endswith("\x1b[2K")  # the line is erased
+    assert "jaxfit: waiting, 0 s" in shown(wait, (x for x in [GRID]))
     assert not _progress_line._lines
 
 
