@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
-from jaxfit._closest import _chunks, _nearest_feet
+from jaxfit._closest import _candidates, _chunks, nearest_feet, starting_feet
+from jaxfit._closest._candidates import Search
 from jaxfit._splines._pieces import make_axis
 
 COUNT = 512  # one size for nearly all queries: few compilations
@@ -179,7 +180,7 @@ def test_known_feet_give_way_to_nearer_ones(wavy):
     found = np.arange(COUNT) % 7 > 0
     u[~found], v[~found] = 0.5, 0.5  # not feet
     distance[~found] = np.linalg.norm(points[~found] - np.asarray(wavy(0.5, 0.5)), axis=1)
-    feet = _nearest_feet.nearest_feet(
+    feet = nearest_feet(
         Newton(),
         np.asarray(wavy.control_points),
         *axes,
@@ -192,25 +193,38 @@ def test_known_feet_give_way_to_nearer_ones(wavy):
     np.testing.assert_allclose(feet["distance"], cold.distance, rtol=0, atol=1e-12)
 
 
-def test_a_search_that_is_not_thorough_finds_nearly_all_nearest_feet(wavy, monkeypatch):
+def test_feet_to_start_from_are_nearly_all_near_the_nearest_though_few_are_searched_for(wavy, monkeypatch):
     points = np.random.default_rng(1).uniform(-0.2, 1.2, (8000, 3))
     net = np.asarray(wavy.control_points)
     axes = [make_axis(np.asarray(knots), 4) for knots in (wavy.knots_u, wavy.knots_v)]
-    searched, candidates = [], _nearest_feet.Search.candidates
+    searched, candidates = [], Search.candidates
 
     def counted(search, points, *found):
-        searched[-1] += len(points)
+        searched.append(len(points))
         return candidates(search, points, *found)
 
-    monkeypatch.setattr(_nearest_feet.Search, "candidates", counted)
-    distances = []
-    for thorough in (True, False):
-        searched.append(0)
-        options = dict(thorough=thorough, tolerance=1e-12, max_steps=60)
-        distances.append(_nearest_feet.nearest_feet(Newton(), net, *axes, points, **options)["distance"])
-    assert searched[1] < 0.8 * searched[0]
-    farther = distances[1] > distances[0] * (1 + 5e-7)
+    monkeypatch.setattr(Search, "candidates", counted)
+    nearest = nearest_feet(Newton(), net, *axes, points, tolerance=1e-12, max_steps=60)["distance"]
+    thorough = sum(searched)
+    start = starting_feet(Newton(), net, *axes, points, tolerance=1e-12, max_steps=60)
+    assert sum(searched) - thorough < 0.8 * thorough
+    farther = np.asarray(closest_point(wavy, points, start=start).distance) > nearest * (1 + 5e-7)
     assert np.mean(farther) < 0.01
+
+
+@pytest.mark.parametrize("outlier", [None, 100.0])
+def test_points_that_far_outnumber_the_samples_start_together_and_find_the_same_feet(
+    wavy, outlier, monkeypatch
+):
+    rng = np.random.default_rng(2)
+    u, v = rng.uniform(size=(2, 40_000))
+    points = np.asarray(wavy(u, v)) + 0.02 * rng.normal(size=(u.size, 3))
+    if outlier is not None:
+        points[::5000] *= outlier
+    together = closest_point(wavy, points)
+    monkeypatch.setattr(_candidates, "MANY", len(points))
+    each = closest_point(wavy, points)
+    np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9, atol=1e-11)
 
 
 def test_starts_near_the_feet_give_the_same_feet(wavy):

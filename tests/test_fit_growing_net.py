@@ -11,7 +11,7 @@ from jaxfit._approximation._errors_of_neighbours import ErrorsOfNeighbours, erro
 from jaxfit._approximation._growing_net import GROWTH, Level, NetGrowth, far_from
 from jaxfit._approximation._level_nets import FIRST_SIZE, BoundaryNets
 from jaxfit._base import carried_base, net_of_sides
-from jaxfit._closest import _nearest_feet
+from jaxfit._closest import _projector
 from jaxfit._compile import compiled
 from jaxfit._fit import _loop
 
@@ -41,7 +41,7 @@ def without_programs(function):
 @pytest.fixture(scope="module")
 def grown_with_programs():
     with pytest.MonkeyPatch.context() as patch:
-        for module, name in ((_loop, "_advance"), (_nearest_feet, "_run")):
+        for module, name in ((_loop, "_advance"), (_projector, "_run")):
             patch.setattr(module, name, without_programs(getattr(module, name)))
         with count_compilations() as programs:
             fit = jf.fit_points(CLEAN, BOUNDARY, tol_average=1e-4)

@@ -20,10 +20,10 @@ from jaxfit._approximation._implicit_fit import (
     with_implicit_derivative,
 )
 from jaxfit._approximation._programs_ahead import programs_ahead
-from jaxfit._approximation._room import Room, nearest_on
+from jaxfit._approximation._room import Room, nearest_on, starts_on
 from jaxfit._approximation._unrolled_fit import unrolled_fit
 from jaxfit._checks import as_points, check_kind, is_concrete, without_derivatives
-from jaxfit._closest import closest_point
+from jaxfit._closest import closest_point, neighbours_together
 from jaxfit._fit._adjoints import ImplicitAdjoint, UnrolledAdjoint
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, run
@@ -107,9 +107,11 @@ def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
 def _nearest(
     base: BSplineSurface, cloud: Any, method: AbstractIterativeMethod, room: Room | None
 ) -> tuple[Any, Any]:
-    """The parameters of the closest points. Methods that find feet themselves need no thorough search."""
+    """The parameters of the closest points; of nearly all, for methods that find feet themselves."""
     if is_concrete(base, cloud):
-        found = nearest_on(base, cloud, room=room, thorough=not method.finds_feet)
+        if method.finds_feet:
+            return starts_on(base, cloud, room)
+        found = nearest_on(base, cloud, room=room)
         return found["u"], found["v"]
     nearest = closest_point(base, cloud)
     return nearest.u, nearest.v
@@ -210,16 +212,15 @@ def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int, often: bo
     not pay unless that is done `often`: points on the host then keep their order.
     """
     axis_u, axis_v = surface.axes
-    concrete = is_concrete(surface.axes, u, v)
-    if concrete and not often:
-        return np.arange(u.shape[0])
-    xp: Any = np if concrete else jnp
+    if is_concrete(surface.axes, u, v):
+        given = np.arange(u.shape[0])
+        together = neighbours_together(surface.axes, u[:count], v[:count]) if often else given[:count]
+        return np.append(together, given[count:])
     cells = axis_u.cells * axis_v.cells
     cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)
     if u.shape[0] > count:
-        cell = xp.where(np.arange(u.shape[0]) >= count, cells, cell)
-    # Numbers of 16 bits are what NumPy sorts in linear time.
-    return xp.argsort(cell.astype(np.uint16) if cells < 1 << 16 else cell, stable=True)
+        cell = jnp.where(np.arange(u.shape[0]) >= count, cells, cell)
+    return jnp.argsort(cell, stable=True)
 
 
 def fitted_surface(

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit._checks import eager_where_concrete
-from jaxfit._closest import Newton, nearest_feet
+from jaxfit._closest import Newton, nearest_feet, starting_feet
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
 from jaxfit._splines import BSplineSurface
@@ -27,23 +27,30 @@ class Room(NamedTuple):
 
 
 @eager_where_concrete
-def nearest_on(
-    surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None, thorough: bool = True
-) -> Any:
-    """The nearest feet on the whole surface, all concrete; `known` and `thorough` as for `nearest_feet`."""
+def nearest_on(surface: BSplineSurface, points: Any, known: Any = None, room: Room | None = None) -> Any:
+    """The nearest feet on the whole surface, all concrete; `known` as for `nearest_feet`."""
+    return nearest_feet(*_searched(surface, points, room), known=known, **_options(surface, room))
+
+
+@eager_where_concrete
+def starts_on(surface: BSplineSurface, points: Any, room: Room | None = None) -> Any:
+    """Parameters to begin with for methods that find feet themselves, all concrete."""
+    return starting_feet(*_searched(surface, points, room), **_options(surface, room))
+
+
+def _searched(surface: BSplineSurface, points: Any, room: Room | None) -> tuple[Any, ...]:
+    """How feet move, the surface, and the points."""
     net, u, v = (np.asarray(x) for x in (surface.control_points, surface.knots_u, surface.knots_v))
     whole = WorkingSurface.of(net, u, v)
     if room is not None:
         whole = whole.padded(room.net[0] - net.shape[0], room.net[1] - net.shape[1])
-    return nearest_feet(
-        Newton(),
-        whole.control_points,
-        *whole.axes,
-        np.asarray(points),
-        known=known,
-        thorough=thorough,
-        tolerance=default_foot_tolerance(net.dtype),
-        max_steps=MAX_STEPS,
-        used=net.shape[:2],
-        chunk=None if room is None else room.chunk,
-    )
+    return Newton(), whole.control_points, *whole.axes, np.asarray(points)
+
+
+def _options(surface: BSplineSurface, room: Room | None) -> dict[str, Any]:
+    return {
+        "tolerance": default_foot_tolerance(np.dtype(surface.control_points.dtype)),
+        "max_steps": MAX_STEPS,
+        "used": surface.shape,
+        "chunk": None if room is None else room.chunk,
+    }

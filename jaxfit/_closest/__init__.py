@@ -2,6 +2,7 @@
 
 from jaxfit._closest._chunks import HostFeet as HostFeet
 from jaxfit._closest._chunks import chunk_size as chunk_size
+from jaxfit._closest._chunks import neighbours_together as neighbours_together
 from jaxfit._closest._closest_point import ClosestPoint as ClosestPoint
 from jaxfit._closest._closest_point import PointStatus as PointStatus
 from jaxfit._closest._closest_point import closest_point as closest_point
@@ -18,3 +19,4 @@ from jaxfit._closest._nearest_feet import compile_search_ahead as compile_search
 from jaxfit._closest._nearest_feet import nearest_feet as nearest_feet
 from jaxfit._closest._project import ParameterBounds as ParameterBounds
 from jaxfit._closest._project import project as project
+from jaxfit._closest._starting_feet import starting_feet as starting_feet

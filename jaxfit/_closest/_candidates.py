@@ -7,6 +7,7 @@ exceeds the foot's by no more than |step|^2 + |e| |R_uu a^2 + 2 R_uv a b + R_vv 
 only. Every sample this close that is not beside a foot already found is a start.
 """
 
+import math
 from functools import cached_property
 from typing import Any
 
@@ -22,9 +23,11 @@ NEIGHBOURS = (8, 24, 80, 200)  # as many as it takes
 LEAST_STARTS = 4  # tried although a sample beside them is nearer
 BLOCK = 8192  # points
 LEAF = 32  # samples; the tree's own default is slower here
-# Of the samples along each direction one in so many serves for starts where points outnumber the samples: the
-# same feet are found from there, in two thirds of the time.
-ONE_IN = 2
+# Where points outnumber samples so many times, those in one box begin from the same sample.
+MANY = 8
+SIDE = 0.5  # of a box, against the distance between samples
+MOST_BOXES = 1 << 24
+AROUND = 0.05  # of the diagonal: how far from the samples there are boxes
 
 
 class Search:
@@ -42,8 +45,10 @@ class Search:
 
     @cached_property
     def tree(self) -> Any:
-        """A tree of all samples, made when first asked for: large clouds may do without."""
-        return _tree(self.cloud)
+        """A tree of all samples, made when first asked for."""
+        from scipy.spatial import KDTree
+
+        return KDTree(self.cloud, LEAF, balanced_tree=False, compact_nodes=False)
 
     def _query(self, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         count = min(count, self.tree.n)
@@ -52,13 +57,25 @@ class Search:
         return distance, index
 
     def nearest(self, points: Float[np.ndarray, "points d"]) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters of a sample near every point: the nearest, of all or of some of them (ONE_IN)."""
-        smooth = self.along_u.smooth and self.along_v.smooth  # each stretch must keep its own
-        if not smooth or len(points) < len(self.cloud):
+        """Parameters of a sample near every point: the nearest, or where points are many the one nearest to
+        the middle of the point's box, no larger than the samples are apart.
+        """
+        boxes = _boxes(self.cloud, SIDE * math.sqrt(np.median(self.step_bound)))
+        if len(points) < MANY * len(self.cloud) or boxes is None:
             return self.parameters(self.tree.query(points, workers=cores())[1])
-        shape = self.along_u.u.size, self.along_v.u.size
-        some = np.arange(len(self.cloud)).reshape(shape)[::ONE_IN, ::ONE_IN].reshape(-1)
-        return self.parameters(some[_tree(self.cloud[some]).query(points, workers=cores())[1]])
+        low, size, counts = boxes
+        place = [np.floor((points[:, k] - low[k]) / size) for k in range(len(counts))]
+        inside = np.logical_and.reduce([(x >= 0) & (x < n) for x, n in zip(place, counts, strict=True)])
+        box = np.ravel_multi_index([np.where(inside, x, 0).astype(np.int32) for x in place], counts)
+        seen = np.zeros(math.prod(counts), bool)
+        seen[box] = True
+        number = np.flatnonzero(seen)
+        middles = low + size * (0.5 + np.stack(np.unravel_index(number, counts), axis=1))
+        sample = np.empty(seen.size, np.int32)
+        sample[number] = self.tree.query(middles, workers=cores())[1]
+        found = sample[box]
+        found[~inside] = self.tree.query(points[~inside], workers=cores())[1]
+        return self.parameters(found)
 
     def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of samples given by number."""
@@ -139,10 +156,13 @@ class Search:
         return low
 
 
-def _tree(points: Float[np.ndarray, "points d"]) -> Any:
-    from scipy.spatial import KDTree
-
-    return KDTree(points, LEAF, balanced_tree=False, compact_nodes=False)
+def _boxes(cloud: Float[np.ndarray, "samples d"], size: float) -> tuple[np.ndarray, float, list[int]] | None:
+    """Corner, size and numbers along each axis of boxes around the samples, unless they would be too many."""
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    margin = AROUND * np.linalg.norm(high - low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        counts = np.ceil((high - low + 2 * margin) / size)
+    return (low - margin, size, [int(n) for n in counts]) if np.prod(counts) <= MOST_BOXES else None
 
 
 class _Direction:

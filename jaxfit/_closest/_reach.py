@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfit._closest._samples import grid_jet
 from jaxfit._cores import on_all_cores
@@ -35,6 +35,7 @@ MOVE = 0.7
 OUTERMOST = 4  # of the neighbours
 ROUNDING = 1e-6  # of a squared length
 LEAF = 16  # samples
+POINTS = 1 << 16  # at a time
 BLOCK = 1 << 14  # samples times neighbours: so few that everything stays in the caches
 
 
@@ -72,10 +73,8 @@ class Reach:
     def exceeds(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
         """Whether the reach at the feet (u, v) exceeds their `distance` from their points."""
         a, b = self.shape
-        row, column = (
-            _interval(axis, x, count - 1) for axis, x, count in zip(self.axes, (u, v), (a, b), strict=True)
-        )
-        place = row * (b - 1) + column
+        parts = [slice(begin, begin + POINTS) for begin in range(0, u.size, POINTS)]
+        place = np.concatenate(on_all_cores(lambda part: self._place(u[part], v[part]), parts))
         below, left = np.zeros(place.size, bool), np.arange(place.size)
         for count in NEIGHBOURS:
             asked = np.zeros((a - 1, b - 1), bool)
@@ -88,6 +87,11 @@ class Reach:
             below[left] = distance[left] <= reach
             left = left[(distance[left] > reach) & (distance[left] <= most)]
         return below
+
+    def _place(self, u: np.ndarray, v: np.ndarray) -> Int[np.ndarray, " points"]:
+        """The numbers of the rectangles between samples that feet lie in."""
+        (axis_u, axis_v), (a, b) = self.axes, self.shape
+        return _interval(axis_u, u, a - 1) * (b - 1) + _interval(axis_v, v, b - 1)
 
     def _reach_between(self, number: np.ndarray, count: int) -> Float[np.ndarray, "2 places"]:
         """The least of `_reach_at` the four samples around each place, as far as these are asked for."""
