@@ -213,6 +213,11 @@ def test_names_and_sizes_get_a_sentence():
         jf.map_fits([np.full((4, 3), "x")], BASE)
     with pytest.raises(ValueError, match="clouds must hold at least one cloud"):
         jf.pad_clouds([])
+    for clouds, kind in (({"a": CLOUDS[0]}, "dict"), ((x for x in CLOUDS), "generator")):
+        with pytest.raises(TypeError, match=f"clouds must be a list of arrays, but is a {kind}"):
+            jf.map_fits(clouds, BASE)
+    with pytest.raises(TypeError, match="executor must be an object such as worker_processes"):
+        jf.map_fits(CLOUDS, BASE, executor="processes")
     with pytest.raises(ValueError, match="weights must hold one number for each point"):
         jf.pad_clouds(CLOUDS, CLOUDS)
     weights = [np.ones(len(cloud)) for cloud in CLOUDS]

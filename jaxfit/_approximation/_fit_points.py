@@ -11,9 +11,10 @@ from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._checked_scan import checked_scan
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
+from jaxfit._approximation._fit_growing import fit_growing
 from jaxfit._approximation._fit_scan import fit_scan
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
-from jaxfit._approximation._growing_net import NetGrowth, fit_growing
+from jaxfit._approximation._growing_net import NetGrowth
 from jaxfit._approximation._level_nets import BoundaryNets
 from jaxfit._approximation._programs_ahead import programs_of_cloud_ahead
 from jaxfit._base import (

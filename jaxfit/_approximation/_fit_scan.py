@@ -11,7 +11,8 @@ from jaxfit._approximation._approximate import default_method
 from jaxfit._approximation._checked_scan import ScanInput
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import GlobalFeet, LocalFeet
-from jaxfit._approximation._growing_net import NetGrowth, fit_everywhere, fit_growing
+from jaxfit._approximation._fit_growing import fit_everywhere, fit_growing
+from jaxfit._approximation._growing_net import NetGrowth
 from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
 from jaxfit._fit._method import AbstractIterativeMethod

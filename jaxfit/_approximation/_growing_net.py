@@ -1,9 +1,7 @@
-"""Fits of clouds whose net grows until the tolerances are met, or until finer nets follow only noise."""
+"""Nets that grow until some of the points meet the tolerances, or finer nets follow only noise."""
 
 import dataclasses
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +19,7 @@ from jaxfit._base import mean_distance_to
 from jaxfit._closest import chunk_size
 from jaxfit._fit._border import FixedBorder
 from jaxfit._fit._reasons import RESULTS
-from jaxfit._fit._result import Fit, converged_or_raise
+from jaxfit._fit._result import Fit
 from jaxfit._splines import BSplineSurface
 
 MOST_SIZE = 200  # control points along either direction
@@ -54,7 +52,6 @@ MULTIPLE = 4  # of control points that there is room for: clouds of similar shap
 FAR = 10.0
 # No net helps where so many of the points lie so far beyond a border that is held, in diagonals.
 MANY_BEYOND, FAR_BEYOND = 0.25, 0.01
-EXTENSIONS = 3  # most nets tried with all points where the chosen one misses the tolerances
 
 
 class Level(NamedTuple):
@@ -128,11 +125,6 @@ class NetGrowth:
         fit = fit_cloud(points, base, self.method, request, room)
         self.steps += int(fit.stats["num_steps"])
         return fit
-
-    def whole(self, size: float, base: BSplineSurface, request: dict[str, Any]) -> Fit:
-        """The fit of all points."""
-        fit = partial(self.fit, self.points, size, base)
-        return fit_everywhere(fit, request) if self.cleaned else fit(request)
 
     def grown(self) -> tuple[Level, Any]:
         """The level to end with, and why there is none beyond it."""
@@ -284,43 +276,3 @@ def without_first_smoothing(method: Any) -> Any:
 def far_from(average: Any) -> float:
     """The maximum that goes with a tolerance for the average."""
     return min(FAR * float(average), 1.0)
-
-
-def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]) -> Fit:
-    """The fit to a cleaned cloud. Without a tolerance for the maximum it goes on until that is FAR times the
-    one for the average, if it comes to that; the average alone decides whether it has converged.
-    """
-    average, throw = request["tol_average"], request["throw"]
-    if average is None or request["tol_maximum"] is not None:
-        return fit(request)
-    found = fit(request | {"tol_maximum": far_from(average), "throw": False})
-    found = dataclasses.replace(found, stats=found.stats | {"tol_maximum": np.inf})  # as it was asked for
-    ended = found.result in (RESULTS.stalled, RESULTS.max_steps_reached)
-    if ended and float(found.average_error) <= average:
-        found = dataclasses.replace(found, result=RESULTS.converged)
-    return converged_or_raise(found) if throw else found
-
-
-def fit_growing(growth: NetGrowth) -> Fit:
-    """The fit with a net of the size that the tolerances take, or that the points allow."""
-    level, why = growth.grown()
-    level = growth.afresh(level)
-    size, request = level.size, growth.request | {"throw": False}
-    if why != RESULTS.converged:
-        request["max_steps"] = min(LEVEL_STEPS, request["max_steps"])
-    request["start"] = growth.nets.feet(growth.net(size))
-    fit = growth.whole(size, level.fit.surface, request)
-    for _ in range(EXTENSIONS if why == RESULTS.converged else 0):
-        size *= GROWTH
-        if bool(fit.converged) or not growth.allows(size):
-            break
-        net = growth.net(size)
-        if net == fit.surface.shape:
-            break
-        request["start"] = growth.nets.feet(net)
-        fit = growth.whole(size, growth.nets.carried(fit.surface, net), request)
-    if fit.result in (RESULTS.stalled, RESULTS.max_steps_reached) and why != RESULTS.converged:
-        fit = dataclasses.replace(fit, result=why)
-    before = growth.steps - int(fit.stats["num_steps"])
-    fit = dataclasses.replace(fit, stats=fit.stats | {"growth_steps": before})
-    return converged_or_raise(fit) if growth.request["throw"] else fit

@@ -1,5 +1,6 @@
 """Arguments that are given once or for each fit."""
 
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,9 @@ class Request(NamedTuple):
 
 def requests_of(clouds: Any, base: Any, method: Any, weights: Any) -> list[Request]:
     """The arguments of each fit; raises if the lists differ in length, or if nothing is one."""
+    if isinstance(clouds, (Mapping, Iterator)):
+        kind = type(clouds).__name__
+        raise TypeError(f"clouds must be a list of arrays, but is a {kind}; pass a list of its arrays.")
     given = {
         "clouds": _each(clouds, 2),
         "base": base,

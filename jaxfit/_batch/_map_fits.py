@@ -14,7 +14,7 @@ from jaxfit._approximation._checked_arguments import check_options, checked_requ
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
 from jaxfit._batch._broadcast import Request, one_by_one, requests_of
 from jaxfit._batch._failed_fit import failed_fit
-from jaxfit._checks import as_points, is_concrete, with_whole_steps
+from jaxfit._checks import as_points, check_kind, is_concrete, with_whole_steps
 from jaxfit._cores import cores
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._result import Fit, converged_or_raise
@@ -90,6 +90,8 @@ def map_fits(
     options = with_whole_steps(options)
     requests = requests_of(clouds, base, method, weights)
     _check_names(options)
+    if executor is not None:
+        check_kind("executor", executor, Executor, "worker_processes(2)")
     if not is_concrete(requests, options):
         traced = one_by_one(lambda request: _fit(request, options), requests)
         return _raised(traced) if throw else tuple(traced)
