@@ -15,6 +15,7 @@ from jaxfit._normal_equations import (
     free_points,
 )
 from jaxfit._normal_equations._block_cholesky import factorise, substitute
+from jaxfit._normal_equations._coupled_preconditioner import inverse_roots
 
 
 @pytest.fixture(scope="module")
@@ -110,3 +111,12 @@ def test_factors_in_single_precision_keep_large_shapes():
     found = substitute(factors, jnp.asarray(right[None], jnp.float32))[0]
     assert float(factors.shift) == 0.0
     assert np.linalg.norm(found - exact) < 0.02 * np.linalg.norm(exact)
+
+
+@pytest.mark.parametrize("shape", [(4, 9), (9, 4)])
+def test_inverse_roots_are_those_of_each_block_of_wide_and_of_tall_nets(shape):
+    factors = np.random.default_rng(5).normal(size=(*shape, 3, 3))
+    blocks = factors @ factors.swapaxes(2, 3) + np.eye(3)
+    roots = np.moveaxis(np.asarray(inverse_roots(jnp.asarray(blocks))), (0, 1), (2, 3))
+    np.testing.assert_allclose(roots, roots.swapaxes(2, 3), atol=1e-12)
+    np.testing.assert_allclose(roots @ roots @ blocks, np.broadcast_to(np.eye(3), blocks.shape), atol=1e-10)

@@ -31,7 +31,7 @@ def map_fits(
     base: BSplineSurface | Sequence[BSplineSurface],
     method: AbstractIterativeMethod | Sequence[AbstractIterativeMethod] | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
-    executor: Executor | None = None,
+    executor: Any = None,
     throw: bool = False,
     **options: Any,
 ) -> tuple[Fit, ...]:

@@ -60,8 +60,9 @@ class Search:
         """Parameters of a sample near every point: the nearest, or where points are many the one nearest to
         the middle of the point's box, no larger than the samples are apart.
         """
-        boxes = _boxes(self.cloud, SIDE * math.sqrt(np.median(self.step_bound)))
-        if len(points) < MANY * len(self.cloud) or boxes is None:
+        many = len(points) >= MANY * len(self.cloud)
+        boxes = _boxes(self.cloud, SIDE * math.sqrt(np.median(self.step_bound))) if many else None
+        if boxes is None:
             return self.parameters(self.tree.query(points, workers=cores())[1])
         low, size, counts = boxes
         place = [np.floor((points[:, k] - low[k]) / size) for k in range(len(counts))]

@@ -39,7 +39,7 @@ def nearest_feet(
         chunk = chunk_size(len(points) if known is None else min(len(points), CHUNK))
     projector = Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     if start is not None:
-        best = {name: np.array(x) for name, x in projector(None, *start).items()}
+        best = projector(None, *start)
     else:
         best = _globally(projector, known, used or net.shape[:2])
     search_borders(projector, best)

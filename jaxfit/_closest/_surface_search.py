@@ -80,6 +80,7 @@ def search_borders(projector: Projector, best: HostFeet) -> None:
     """Search for feet that have not converged on the borders, too."""
     lost = np.flatnonzero(~best["converged"])
     if lost.size:
+        best |= {name: np.array(x) for name, x in best.items()}  # those of JAX can't be written to
         take_nearer(best, lost, projector(lost, best["u"][lost], best["v"][lost], borders=True))
 
 

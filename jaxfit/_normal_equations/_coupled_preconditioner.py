@@ -51,15 +51,20 @@ def coupled_preconditioner(
     diagonal = jnp.where(free, uncoupled.diagonal, 1.0)[:, :, None, None]
     blocks = matrix.blocks / diagonal
     unit = jnp.eye(blocks.shape[-1], dtype=diagonal.dtype)
-    # A row at a time: LAPACK's threads divide some 1,500 small matrices among themselves, and two fits at
-    # once, as on two devices, then wait for each other's for ever.
-    values, vectors = lax.map(
-        partial(jnp.linalg.eigh, symmetrize_input=False),
-        jnp.where(free[:, :, None, None], blocks, unit[None, None]),
-    )
-    scaled = vectors * lax.rsqrt(jnp.maximum(values, LEAST_SHARE))[:, :, None, :]
-    roots = jnp.einsum("ijab,ijcb->acij", scaled, vectors, precision="highest")
+    roots = inverse_roots(jnp.where(free[:, :, None, None], blocks, unit[None, None]))
     return CoupledPreconditioner(factorise(uncoupled, free), roots)
+
+
+def inverse_roots(blocks: Float[Array, "nu nv d d"]) -> Float[Array, "d d nu nv"]:
+    """The symmetric square roots of the inverses of symmetric blocks."""
+    # A short row at a time: LAPACK's threads divide some 1,500 small matrices among themselves, and two fits
+    # at once, as on two devices, then wait for each other's for ever.
+    short = blocks.shape[1] <= blocks.shape[0]
+    rows = blocks if short else blocks.swapaxes(0, 1)
+    values, vectors = lax.map(partial(jnp.linalg.eigh, symmetrize_input=False), rows)
+    scaled = vectors * lax.rsqrt(jnp.maximum(values, LEAST_SHARE))[:, :, None, :]
+    along = "ijab,ijcb->acij" if short else "jiab,jicb->acij"
+    return jnp.einsum(along, scaled, vectors, precision="highest")
 
 
 def solve_coupled(
