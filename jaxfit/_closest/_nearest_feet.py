@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxfit._closest._chunks import CHUNK, HostFeet, chunk_size
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._projector import Projector
-from jaxfit._closest._surface_search import SurfaceSearch, search_borders, take_nearer
+from jaxfit._closest._surface_search import SurfaceSearch, search_borders
 from jaxfit._splines._pieces import Axis
 
 
@@ -68,8 +68,6 @@ def _globally(projector: Projector, known: Any, used: tuple[int, int]) -> HostFe
         best = {name: np.array(x) for name, x in zip(names, known, strict=True)}
         squares = (best.pop("distance") / projector.unit) ** 2
         best |= {"f": squares, "steps": np.zeros(squares.size, np.int32)}
-        lost = np.flatnonzero(~best["converged"])
-        if lost.size:
-            take_nearer(best, lost, search.local_feet(lost))
+    search.begin_anew(best)
     search.try_candidates(search.doubtful(best), best)
     return best

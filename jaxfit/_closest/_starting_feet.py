@@ -36,6 +36,7 @@ def starting_feet(
     projector = Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     search = SurfaceSearch(projector, used or net.shape[:2])
     best = search.local_feet()
+    search.begin_anew(best)
     _search_where_some_are_misled(search, search.doubtful(best), best)
     search_borders(projector, best)  # a foot that can't be found costs the fit all evaluations it has
     return best["u"], best["v"]

@@ -39,6 +39,12 @@ class SurfaceSearch:
         start = self.samples.nearest(points if which is None else points[which])
         return {name: np.array(x) for name, x in self.projector(which, *start).items()}
 
+    def begin_anew(self, best: HostFeet) -> None:
+        """Find feet that have not converged from their own nearest samples."""
+        lost = np.flatnonzero(~best["converged"])
+        if lost.size:
+            take_nearer(best, lost, self.local_feet(lost))
+
     def doubtful(self, best: HostFeet) -> Int[np.ndarray, " _"]:
         """The points for which there may be nearer feet: all where the reach is not estimated, since tangent
         planes jump, points are not in space or too few.
