@@ -212,18 +212,29 @@ def test_feet_to_start_from_are_nearly_all_near_the_nearest_though_few_are_searc
     assert np.mean(farther) < 0.01
 
 
-@pytest.mark.parametrize("outlier", [None, 100.0])
-def test_points_that_far_outnumber_the_samples_start_together_and_find_the_same_feet(
-    wavy, outlier, monkeypatch
+def ridged():
+    """A ridge along a triple knot."""
+    knots, net = np.array([0, 0, 0, 0, 0.3, 0.3, 0.3, 0.6, 1, 1, 1, 1]), helpers.wavy_net(8, 8)
+    net[3:5, :, 2] += 0.2
+    return BSplineSurface(net, knots, knots)
+
+
+@pytest.mark.parametrize(("surface_of", "outlier"), [(None, 1.0), (None, 100.0), (ridged, 1.0)])
+def test_points_that_far_outnumber_samples_start_together_and_find_the_same_feet(
+    wavy, surface_of, outlier, monkeypatch
 ):
+    surface = wavy if surface_of is None else surface_of()
     rng = np.random.default_rng(2)
     u, v = rng.uniform(size=(2, 40_000))
-    points = np.asarray(wavy(u, v)) + 0.02 * rng.normal(size=(u.size, 3))
-    if outlier is not None:
-        points[::5000] *= outlier
-    together = closest_point(wavy, points)
+    points = np.asarray(surface(u, v)) + 0.02 * rng.normal(size=(u.size, 3))
+    points[::5000] *= outlier
+    made, boxes = [], _candidates._boxes
+    monkeypatch.setattr(_candidates, "_boxes", lambda *x: made.append(boxes(*x)) or made[-1])
+    together = closest_point(surface, points)
+    assert len(made) == 1
+    assert made[0] is not None
     monkeypatch.setattr(_candidates, "MANY", len(points))
-    each = closest_point(wavy, points)
+    each = closest_point(surface, points)
     np.testing.assert_allclose(together.distance, each.distance, rtol=1e-9, atol=1e-11)
 
 

@@ -206,7 +206,7 @@ def _padded(x: Any, size: int, dtype: Any) -> Any:
 
 
 def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int, often: bool = True) -> Any:
-    """The points sorted by cell, the `count` true ones first.
+    """The points sorted by cell, on the host by rectangles of a uniform grid, the `count` true ones first.
 
     Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster. Sorting does
     not pay unless that is done `often`: points on the host then keep their order.

@@ -24,11 +24,9 @@ class Extrapolation(eqx.Module):
 
     @staticmethod
     def initial(u: Any) -> "Extrapolation":
-        """Before the first step, which leads to the first feet and is not extrapolated; `u` gives shape and
-        type.
-        """
+        """Before the first step; `u` gives shape and type."""
         xp: Any = np if is_concrete(u) else jnp
-        return Extrapolation(xp.zeros((2, *u.shape), u.dtype), xp.zeros((), u.dtype))
+        return Extrapolation(xp.zeros((2, *u.shape), u.dtype), xp.asarray(np.inf, u.dtype))
 
     def predict(self, axes: tuple[Axis, Axis], u: Array, v: Array) -> tuple[Array, Array]:
         """The start of feet at (u, v): within the domain, and at most FARTHEST away."""

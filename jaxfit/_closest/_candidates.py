@@ -26,7 +26,7 @@ LEAF = 32  # samples; the tree's own default is slower here
 # Where points outnumber samples so many times, those in one box begin from the same sample.
 MANY = 8
 SIDE = 0.5  # of a box, against the distance between samples
-MOST_BOXES = 1 << 24
+MOST_BOXES = 1 << 24  # beyond, each point asks the tree
 AROUND = 0.05  # of the diagonal: how far from the samples there are boxes
 
 
@@ -58,24 +58,30 @@ class Search:
 
     def nearest(self, points: Float[np.ndarray, "points d"]) -> tuple[np.ndarray, np.ndarray]:
         """Parameters of a sample near every point: the nearest, or where points are many the one nearest to
-        the middle of the point's box, no larger than the samples are apart.
+        the middle of the box that the point is in.
         """
         many = len(points) >= MANY * len(self.cloud)
         boxes = _boxes(self.cloud, SIDE * math.sqrt(np.median(self.step_bound))) if many else None
         if boxes is None:
             return self.parameters(self.tree.query(points, workers=cores())[1])
         low, size, counts = boxes
-        place = [np.floor((points[:, k] - low[k]) / size) for k in range(len(counts))]
-        inside = np.logical_and.reduce([(x >= 0) & (x < n) for x, n in zip(place, counts, strict=True)])
-        box = np.ravel_multi_index([np.where(inside, x, 0).astype(np.int32) for x in place], counts)
-        seen = np.zeros(math.prod(counts), bool)
-        seen[box] = True
+
+        def box_of(part: slice) -> np.ndarray:
+            place = np.floor((points[part] - low) / size)
+            inside = ((place >= 0) & (place < counts)).all(axis=1)
+            number = np.ravel_multi_index(tuple(np.where(inside[:, None], place, 0).astype(int).T), counts)
+            return np.where(inside, number, -1).astype(np.int32)
+
+        parts = [slice(begin, begin + BLOCK) for begin in range(0, len(points), BLOCK)]
+        box = np.concatenate(on_all_cores(box_of, parts))
+        sample = np.zeros(math.prod(counts) + 1, np.int32)  # the last is for points outside
+        seen = np.zeros(sample.size, bool)
+        seen[box], seen[-1] = True, False
         number = np.flatnonzero(seen)
         middles = low + size * (0.5 + np.stack(np.unravel_index(number, counts), axis=1))
-        sample = np.empty(seen.size, np.int32)
         sample[number] = self.tree.query(middles, workers=cores())[1]
-        found = sample[box]
-        found[~inside] = self.tree.query(points[~inside], workers=cores())[1]
+        found, outside = sample[box], box < 0
+        found[outside] = self.tree.query(points[outside], workers=cores())[1]
         return self.parameters(found)
 
     def parameters(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -157,13 +163,15 @@ class Search:
         return low
 
 
-def _boxes(cloud: Float[np.ndarray, "samples d"], size: float) -> tuple[np.ndarray, float, list[int]] | None:
+def _boxes(
+    cloud: Float[np.ndarray, "samples d"], size: float
+) -> tuple[np.ndarray, float, tuple[int, ...]] | None:
     """Corner, size and numbers along each axis of boxes around the samples, unless they would be too many."""
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = AROUND * np.linalg.norm(high - low)
     with np.errstate(divide="ignore", invalid="ignore"):
         counts = np.ceil((high - low + 2 * margin) / size)
-    return (low - margin, size, [int(n) for n in counts]) if np.prod(counts) <= MOST_BOXES else None
+    return (low - margin, size, tuple(int(n) for n in counts)) if np.prod(counts) <= MOST_BOXES else None
 
 
 class _Direction:

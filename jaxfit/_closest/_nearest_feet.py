@@ -68,6 +68,6 @@ def _globally(projector: Projector, known: Any, used: tuple[int, int]) -> HostFe
         best = {name: np.array(x) for name, x in zip(names, known, strict=True)}
         squares = (best.pop("distance") / projector.unit) ** 2
         best |= {"f": squares, "steps": np.zeros(squares.size, np.int32)}
-    search.begin_anew(best)
+    search.retry_lost(best)
     search.try_candidates(search.doubtful(best), best)
     return best

@@ -36,13 +36,13 @@ def starting_feet(
     projector = Projector(method, net, (axis_u, axis_v), points, tolerance, max_steps, chunk)
     search = SurfaceSearch(projector, used or net.shape[:2])
     best = search.local_feet()
-    search.begin_anew(best)
-    _search_where_some_are_misled(search, search.doubtful(best), best)
+    search.retry_lost(best)
+    _search_cell_by_cell(search, search.doubtful(best), best)
     search_borders(projector, best)  # a foot that can't be found costs the fit all evaluations it has
     return best["u"], best["v"]
 
 
-def _search_where_some_are_misled(search: SurfaceSearch, left: Int[np.ndarray, " _"], best: HostFeet) -> None:
+def _search_cell_by_cell(search: SurfaceSearch, left: Int[np.ndarray, " _"], best: HostFeet) -> None:
     """Search for SOME of the points `left` in each cell, and for the other points of cells where that has
     found much nearer feet, and of the cells around these. Where points are few all are searched for.
     """
@@ -53,10 +53,10 @@ def _search_where_some_are_misled(search: SurfaceSearch, left: Int[np.ndarray, "
     some = np.argsort(place, kind="stable")[::every]
     limit = MUCH_NEARER * best["f"][left[some]]
     search.try_candidates(left[some], best)
-    misled = best["f"][left[some]] < limit
-    if every == 1 or not misled.any():
+    farther = best["f"][left[some]] < limit
+    if every == 1 or not farther.any():
         return
-    row, column = np.divmod(place[some[misled]], cells[1])
+    row, column = np.divmod(place[some[farther]], cells[1])
     around = np.zeros((cells[0] + 2, cells[1] + 2), bool)
     for i, j in np.ndindex(3, 3):
         around[row + i, column + j] = True

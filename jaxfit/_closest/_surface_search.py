@@ -1,4 +1,4 @@
-"""`SurfaceSearch`: where on a surface nearer feet than those found may be, and which."""
+"""`SurfaceSearch`: local feet from samples of a surface, and the search for nearer ones elsewhere on it."""
 
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ LEAST_POINTS_PER_CELL = 24
 
 
 class SurfaceSearch:
-    """The surface of a projector, of whose control points `used` are in use along u and v."""
+    """Searches the surface of a projector, of whose control points `used` are in use along u and v."""
 
     def __init__(self, projector: Projector, used: tuple[int, int]):
         self.projector = projector
@@ -39,7 +39,7 @@ class SurfaceSearch:
         start = self.samples.nearest(points if which is None else points[which])
         return {name: np.array(x) for name, x in self.projector(which, *start).items()}
 
-    def begin_anew(self, best: HostFeet) -> None:
+    def retry_lost(self, best: HostFeet) -> None:
         """Find feet that have not converged from their own nearest samples."""
         lost = np.flatnonzero(~best["converged"])
         if lost.size:
