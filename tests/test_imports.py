@@ -12,7 +12,7 @@ PACKAGE = CHECKOUT / "jaxfit"
 # Lowest first; a room may import its own modules and those of the lines above it.
 ROOMS = [
     ("_interrupt", "_version", "_cores"),
-    ("_checks",),
+    ("_checks", "_remembered"),
     ("_precision", "_progress_line"),
     ("_varying", "_differentiable_once"),
     ("_kept_programs",),

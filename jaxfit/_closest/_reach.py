@@ -69,6 +69,8 @@ class Reach:
         most_curved = np.abs(mean) + np.sqrt(np.maximum(mean * mean - gauss, 0))
         self.half_radius = SHARE_OF_RADIUS / np.maximum(most_curved, np.finfo(E.dtype).tiny)
         self.tree = KDTree(self.points.T, LEAF, balanced_tree=False, compact_nodes=False)
+        # By the number of neighbours, what `_reach_at` found at the samples asked for so far; elsewhere NaN.
+        self.limits = {count: np.full((2, self.points.shape[1]), np.nan) for count in NEIGHBOURS}
 
     def exceeds(self, u: np.ndarray, v: np.ndarray, distance: np.ndarray) -> Bool[np.ndarray, " points"]:
         """Whether the reach at the feet (u, v) exceeds their `distance` from their points."""
@@ -95,11 +97,12 @@ class Reach:
 
     def _reach_between(self, number: np.ndarray, count: int) -> Float[np.ndarray, "2 places"]:
         """The least of `_reach_at` the four samples around each place, as far as these are asked for."""
-        step = max(1, BLOCK // count)
-        parts = [number[begin : begin + step] for begin in range(0, number.size, step)]
-        limits = np.full((2, math.prod(self.shape)), np.inf)
+        limits, step = self.limits[count], max(1, BLOCK // count)
+        new = number[np.isnan(limits[0, number])]
+        parts = [new[begin : begin + step] for begin in range(0, new.size, step)]
         at_samples = partial(self._reach_at, count=min(count, self.tree.n))
-        limits[:, number] = np.concatenate(on_all_cores(at_samples, parts), axis=1)
+        for part, found in zip(parts, on_all_cores(at_samples, parts), strict=True):
+            limits[:, part] = found
         return np.stack([_least_of_four(x.reshape(self.shape)).reshape(-1) for x in limits])
 
     def _reach_at(self, number: np.ndarray, count: int) -> Float[np.ndarray, "2 samples"]:

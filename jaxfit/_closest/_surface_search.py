@@ -11,12 +11,14 @@ from jaxfit._closest._chunks import HostFeet, neighbours_together
 from jaxfit._closest._projector import Projector
 from jaxfit._closest._reach import POINTS_PER_SAMPLE, Reach, number_of_samples
 from jaxfit._closest._samples import sample
+from jaxfit._remembered import remembered
 from jaxfit._splines._pieces import Axis
 
 MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
 # Where cells are few the reach costs little, and it spares searches that exchange feet for the same ones with
 # other last digits.
 LEAST_POINTS_PER_CELL = 24
+LAST_SURFACES = 2  # whose samples are remembered
 
 
 class SurfaceSearch:
@@ -30,7 +32,7 @@ class SurfaceSearch:
     @cached_property
     def samples(self) -> Search:
         """Samples of the surface, made when first asked for: large clouds may do without."""
-        return Search(sample(self.net.astype(self.projector.dtype), *self.axes))
+        return _search_of(self.net.astype(self.projector.dtype), *self.axes)
 
     def local_feet(self, which: Any = None) -> HostFeet:
         """Feet of the points `which` (None: all), found from samples near these."""
@@ -55,7 +57,7 @@ class SurfaceSearch:
         enough = min(POINTS_PER_SAMPLE * number_of_samples(*axes), LEAST_POINTS_PER_CELL * cells)
         if not smooth or self.net.shape[2] != 3 or count < enough:
             return np.arange(count)
-        below = Reach(self.net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
+        below = _reach_of(self.net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
         return np.flatnonzero(~(below & best["converged"]))
 
     def try_candidates(self, left: np.ndarray, best: HostFeet) -> None:
@@ -80,6 +82,16 @@ class SurfaceSearch:
             part = slice(begin, begin + MOST_STARTS)
             chosen = left[which[part]]
             take_nearer(best, chosen, self.projector(chosen, u[part], v[part]))
+
+
+@remembered(LAST_SURFACES)
+def _search_of(net: np.ndarray, axis_u: Axis, axis_v: Axis) -> Search:
+    return Search(sample(net, axis_u, axis_v))
+
+
+@remembered(LAST_SURFACES)
+def _reach_of(net: np.ndarray, axis_u: Axis, axis_v: Axis) -> Reach:
+    return Reach(net, axis_u, axis_v)
 
 
 def search_borders(projector: Projector, best: HostFeet) -> None:

@@ -19,10 +19,12 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._checks import is_concrete
+from jaxfit._remembered import remembered
 from jaxfit._splines._lookup import last_not_above, windows
 from jaxfit._varying import as_varying
 
 Numbers = Array | np.ndarray
+LAST_KNOTS = 32  # prepared knot vectors that are remembered
 
 
 class Axis(eqx.Module):
@@ -111,6 +113,11 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     Concrete knots are dealt with by NumPy, so that nothing compiles. Of others it has to be assumed that they
     repeat, unless interior knots are known to be `simple`.
     """
+    prepare = _axis_on_host if is_concrete(knots) else _axis
+    return prepare(knots, order, simple)
+
+
+def _axis(knots: Float[Numbers, " knots"], order: int, simple: bool) -> Axis:
     concrete = is_concrete(knots)
     xp: Any = np if concrete else jnp
     dtype, knots = knots.dtype, np.asarray(knots, np.float64) if concrete else knots
@@ -153,6 +160,14 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
         polynomials=polynomials.astype(dtype),
         creased=creased,
     )
+
+
+@remembered(LAST_KNOTS)
+def _axis_on_host(knots: Any, order: Any, simple: Any) -> Axis:
+    axis = _axis(knots, int(order), bool(simple))
+    for array in jax.tree.leaves(axis):
+        array.flags.writeable = False  # for it is shared
+    return axis
 
 
 def _where(condition: Any, x: Any, y: float | Any) -> Any:
