@@ -47,6 +47,13 @@ def without_derivatives(tree: Any) -> Any:
     return jax.tree.map(value, tree)
 
 
+def _without_tangents(x: Any) -> Any:
+    """The same as an array's value to look at: under `grad` alone it holds numbers. Nothing is traced."""
+    while isinstance(x, jax.core.Tracer) and hasattr(x, "primal"):
+        x = x.primal
+    return x
+
+
 def eager_where_concrete(function: Callable[..., Any]) -> Callable[..., Any]:
     """Have `function` computed at once, even while something around it is traced, if none of its arguments
     is: inside `jit` JAX would otherwise trace what depends on constants only.
@@ -99,8 +106,9 @@ def as_floating(name: str, x: ArrayLike, ndim: int) -> Any:
         array = array.astype(np.float64 if isinstance(array, np.ndarray) else jnp.result_type(float))
     elif not array.dtype.isnative:  # JAX takes no other order of bytes
         array = array.astype(array.dtype.newbyteorder("="))
-    if is_concrete(array) and array.size:
-        check_finite(name, array)
+    known = _without_tangents(array)
+    if is_concrete(known) and array.size:
+        check_finite(name, known)
     return array
 
 
@@ -202,8 +210,9 @@ def as_points(name: str, x: ArrayLike, dimension: int | None = None, least: int 
             f"{name} must hold at least {least} point{'s' * (least != 1)}, but has shape "
             f"{array.shape}; give more points."
         )
-    if is_concrete(array):
-        check_magnitude(name, array)
+    known = _without_tangents(array)
+    if is_concrete(known):
+        check_magnitude(name, known)
     return array
 
 

@@ -583,3 +583,29 @@ def test_an_interrupted_command_is_quiet(tmp_path, seconds):
     assert (running.returncode, output) == (130, "")
     assert error in ("", "jaxfit: error: interrupted, nothing more is written.\n")
     assert os.listdir(tmp_path) == ["grid.npz"]
+
+
+# ------------------------------------------------------------------ under grad, where values are known
+
+SURFACE = wavy_surface(7, 6)
+UNDER_GRAD = {
+    "points of a fit": (lambda x: jf.approximate(x, SURFACE, max_steps=1).surface(0.3, 0.7)[2], POINTS),
+    "points to project": (lambda x: jf.closest_point(SURFACE, x).distance.sum(), POINTS),
+    "a grid": (lambda x: jf.interpolate(x).surface(0.3, 0.7)[2], GRID),
+}
+
+
+@pytest.mark.parametrize(("function", "given"), UNDER_GRAD.values(), ids=UNDER_GRAD)
+def test_what_is_not_finite_is_refused_under_grad_as_it_is_without(function, given):
+    broken = np.array(given)
+    broken.reshape(-1, 3)[3, 1] = np.nan
+    with pytest.raises(ValueError, match="must be finite") as raised:
+        jax.grad(function)(broken)
+    with pytest.raises(ValueError, match="must be finite") as plain:
+        function(broken)
+    assert sentence(raised) == sentence(plain)
+
+
+def test_a_grid_whose_squares_overflow_is_refused():
+    with pytest.raises(ValueError, match="grid must be at most 1e"):
+        jf.interpolate(1e155 * GRID)

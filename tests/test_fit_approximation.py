@@ -270,8 +270,13 @@ def test_outliers_above_the_border_are_not_beyond_it(base):
     assert (np.asarray(fit.u)[:10] == 0).all()
     assert fit.stats["points_beyond_border"] == 0
     assert "100% of all errors are those of 5% of the points; if these are outliers" in fit.message
+    assert "or pass a method with loss=Tukey()." in fit.message
     rested = dataclasses.replace(fit, result=jf.RESULTS.net_exhausted)
     assert "pass a net" not in rested.message
+    robust = jf.GeometricApproximation(loss=jf.Tukey())
+    robust = jf.approximate(points, base, robust, max_steps=0, tol_average=1e-4)
+    assert robust.stats["loss"] == "Tukey"
+    assert robust.message.endswith("if these are outliers, judge the surface by the others.")
     weights = np.where(np.arange(500) < 10, 0.0, 1.0)
     counted = jf.approximate(
         points, base, jf.GeometricApproximation(), max_steps=0, tol_average=0, weights=weights

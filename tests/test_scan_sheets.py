@@ -86,6 +86,21 @@ def test_points_strewn_about_a_sheet_are_outliers(count, size):
     assert (found.kept >= 5000).sum() <= 0.1 * count
 
 
+@pytest.mark.parametrize("seed", [2, 3, 5])
+def test_one_stray_in_ten_pulls_no_flaps_out_of_a_sheet(seed):
+    """They are not so sparse that each is alone, and would be joined to the rim by long triangles."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-1, 1, size=(2, 1500))
+    points = np.stack([x, y, 0.3 * np.sin(3 * x) * np.cos(2 * y)], axis=1)
+    astray = rng.choice(1500, 150, replace=False)
+    points[astray, 2] += rng.uniform(0.3, 2, 150) * rng.choice([-1, 1], 150)
+    sheet = sheet_of(points)
+    on_sheet = sheet.number[sheet.on_sheet]
+    assert not np.isin(astray, on_sheet).any()
+    assert len(on_sheet) >= 1345
+    assert sheet.hole_length < 0.4
+
+
 def test_points_at_a_wrong_level_are_no_second_sheet():
     """They are few, if far apart: their triangles are as large as the sheet."""
     x, y = (np.random.default_rng(0).uniform(0, 1, (4800, 2)) * [80, 60]).T

@@ -177,8 +177,10 @@ def stats_of(
     method: AbstractIterativeMethod, tolerances: Tolerances, steps: Any, unit: Unit, unconverged_feet: Any
 ) -> dict[str, Any]:
     """What the `stats` of every fit of a cloud hold."""
+    loss = getattr(method, "loss", None)
     return {
         "method": Name(type(method).__name__),
+        **({} if loss is None else {"loss": Name(type(loss).__name__)}),
         "num_steps": steps,
         "tol_average": tolerances.average,
         "tol_maximum": tolerances.maximum,

@@ -113,7 +113,9 @@ class Tukey(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        As for `Huber`, but by default 14 standard deviations.
+        As for `Huber`, but by default 14 standard deviations. That breaks down where a tenth of the points
+        or more are outliers, and then the surface follows them: pass a scale, some times the noise, and a
+        base surface that is nearer than it.
 
     Notes
     -----

@@ -56,9 +56,10 @@ def share_of_outliers(fit: Any) -> float:
 def with_outliers(fit: Any, sentence: str, share: float) -> str:
     """The reason, and that few points have most of the errors."""
     sentence = _without_advice(fit, sentence)
+    advice = ", and leave them out or pass a method with loss=Tukey()" * ("loss" not in fit.stats)
     return (
         f"{sentence} {share:.0%} of all errors are those of {FEW:.0%} of the points; if these are outliers, "
-        "judge the surface by the others, and leave them out or pass a method with loss=Tukey()."
+        f"judge the surface by the others{advice}."
     )
 
 

@@ -10,6 +10,7 @@ from jax.typing import ArrayLike
 from jaxfit._checks import (
     as_floating,
     check_kind,
+    check_magnitude,
     check_number,
     check_progress,
     check_steps,
@@ -152,5 +153,6 @@ def _checked_grid(grid: Any, order: tuple[int, int]) -> Any:
     if not is_concrete(data):
         return data.astype(working_dtype())
     whole = np.asarray(data)  # NumPy's arrays cost no calls of their own
+    check_magnitude("grid", whole)
     check_measured("grid", whole.reshape(-1, d), "fit what is left by fit_points, as a cloud")
     return whole

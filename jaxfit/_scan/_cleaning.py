@@ -14,7 +14,8 @@ FAR = 4.0  # times the usual distance of neighbours: a point with nobody near,
 ALOFT = 0.2  # if it is off their plane by so much of its own distance from them,
 SPARSE = 2.0  # or that is so many times what
 COMMON = 0.95  # of all points have at most: the cloud is nowhere so sparse
-STREWN = 10.0  # times the median distance of neighbours: of points that are off their plane by ALOFT, too
+STREWN = 5.0  # times the median distance of neighbours: of points that are off their plane
+STREWN_ALOFT = 0.3  # by so much of it, too
 ROUNDS = 4  # most: each finds most of the points that are strewn about
 OFF_USUAL = 8.0  # times the median height of the neighbours over their own planes,
 OFF_MOST = 4.0  # times what four in five of them stay below,
@@ -70,7 +71,7 @@ def _outliers(points: np.ndarray) -> tuple[Bool[np.ndarray, " points"], Bool[np.
     least = ROUNDING * np.linalg.norm(np.ptp(middle, axis=0))
     off = (height > OFF_USUAL * usual) & (height > OFF_MOST * most) & (height > OFF_SPACING * spacing + least)
     far = reach > FAR * spacing + least
-    strewn = (reach > STREWN * np.median(reach)) & (height > ALOFT * reach)
+    strewn = (reach > STREWN * np.median(reach)) & (height > STREWN_ALOFT * reach)
     return off | far & ((height > ALOFT * reach) | (reach > SPARSE * np.quantile(reach, COMMON))), strewn
 
 

@@ -152,6 +152,8 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
             f"{path}: points has shape {array.shape}; it must be (N, 3), or a grid (n, m, 3) if these are "
             "heights."
         )
+    if key == "grid" and array.ndim == 3 and (3 in array.shape[:2] or array.shape[2] > MOST_COLUMNS):
+        _check_coordinates_last(array.shape, path)
     array = _coordinates(array, key, ndim, shape, path)
     if array.size < 3 * _LEAST_POINTS:
         raise InputError(
@@ -161,6 +163,14 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
     if key == "grid":
         return grid_data(array, path.name, path)
     return PointData(array, None, None, path.name)
+
+
+def _check_coordinates_last(shape: tuple[int, ...], path: Path) -> None:
+    """Raise for a grid whose last axis holds more than three, where another one may be the coordinates'."""
+    if shape[2] > 3:
+        axis = shape.index(3) if 3 in shape[:2] else None
+        remedy = "(n, m, 3)" if axis is None else f"(n, m, 3): store np.moveaxis(grid, {axis}, -1)"
+        raise InputError(f"{path}: grid has shape {shape}; it must be {remedy}.")
 
 
 def _coordinates(
