@@ -108,6 +108,18 @@ def test_feet_go_to_a_file_that_holds_u_v_and_errors(base, streamed, tmp_path):
     np.testing.assert_allclose(np.asarray(feet.distance) / diagonal, stored[2], rtol=0, atol=1e-7)
 
 
+def test_a_fit_that_is_broken_off_leaves_no_file_of_feet(base, tmp_path):
+    def broken_off(step, *_):
+        assert (tmp_path / "feet.npy").exists()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jf.approximate_stream(
+            POINTS, base, block_size=BLOCK, feet_file=tmp_path / "feet.npy", progress=broken_off, **GOALS
+        )
+    assert not list(tmp_path.iterdir())
+
+
 def test_progress_is_reported_after_every_pass(base, streamed):
     seen = []
     jf.approximate_stream(POINTS, base, block_size=BLOCK, progress=lambda *x: seen.append(x), **GOALS)

@@ -1,5 +1,6 @@
 """`StoredFeet`: the feet of all points, and at the end the errors, in twelve bytes a point."""
 
+import contextlib
 import os
 from typing import Any
 
@@ -23,6 +24,7 @@ class StoredFeet:
 
     def __init__(self, count: int, domain: Any, file: str | os.PathLike[str] | None):
         shape = (3, count)
+        self.file = file
         self.rows: np.ndarray
         if file is None:
             self.rows = np.empty(shape, np.float32)
@@ -55,3 +57,9 @@ class StoredFeet:
     def finish(self, start: int, u: Any, v: Any, errors: Any) -> None:
         """The last feet and the errors of the points from `start` on, which are not read again."""
         self.rows[:, start : start + len(u)] = np.stack([u, v, errors])
+
+    def discard(self) -> None:
+        """Remove the file: what a fit that ended early leaves in it are no feet."""
+        if self.file is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(self.file)

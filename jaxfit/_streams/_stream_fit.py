@@ -47,6 +47,20 @@ def fit_stream(
     """`approximate_stream`, the options that it shares with `approximate` in a dictionary."""
     streamed = _checked_method(base, method, block_size, request)
     passes = _opened(source, base, streamed, block_size, feet_file, request)
+    try:
+        return _fitted(passes, base, method, streamed, request)
+    except BaseException:
+        passes.feet.discard()
+        raise
+
+
+def _fitted(
+    passes: Passes,
+    base: BSplineSurface,
+    method: AbstractIterativeMethod,
+    streamed: AbstractIterativeMethod,
+    request: dict[str, Any],
+) -> Fit:
     unit = passes.unit
     begun = working_surface(base, unit, True)
     nothing = make_problem(np.zeros((0, base.dimension)), None, unit, passes.tolerances, padded=False)
