@@ -39,16 +39,14 @@ def without_derivatives(tree: Any) -> Any:
     """The tree with `stop_gradient` of its tracers; the rest is left as it is."""
 
     def value(x: Any) -> Any:
-        if not isinstance(x, jax.core.Tracer):
-            return x
-        x = jax.lax.stop_gradient(x)
-        return x if isinstance(x, jax.core.Tracer) else jax.device_put(np.asarray(x))
+        x = _without_tangents(x)
+        return jax.lax.stop_gradient(x) if isinstance(x, jax.core.Tracer) else x
 
     return jax.tree.map(value, tree)
 
 
 def _without_tangents(x: Any) -> Any:
-    """The same as an array's value to look at: under `grad` alone it holds numbers. Nothing is traced."""
+    """An array without the tangents that `grad` gives it: under `grad` alone its numbers. Traces nothing."""
     while isinstance(x, jax.core.Tracer) and hasattr(x, "primal"):
         x = x.primal
     return x

@@ -32,22 +32,22 @@ class _Contents(NamedTuple):
 
 
 def remembered(most: int) -> Callable[[Function], Function]:
-    """Keep the last `most` results of a function of concrete pytrees of arrays.
+    """Keep the last `most` results of a function of concrete pytrees, whose arrays it is given as NumPy's.
 
-    All who ask share a result, so nobody may change it; the function is given arrays of NumPy.
+    All who ask share a result, so nobody may change it.
     """
 
     def decorated(function: Function) -> Function:
         @lru_cache(most)
-        def of_contents(tree: Any, *contents: _Contents) -> Any:
-            return function(*jax.tree.unflatten(tree, [x.array() for x in contents]))
+        def of_contents(tree: Any, *contents: Any) -> Any:
+            leaves = [x.array() if isinstance(x, _Contents) else x for x in contents]
+            return function(*jax.tree.unflatten(tree, leaves))
 
         @wraps(function)
         def asked(*args: Any) -> Any:
             leaves, tree = jax.tree.flatten(args)
-            return of_contents(tree, *map(_Contents.of, leaves))
+            return of_contents(tree, *(_Contents.of(x) if hasattr(x, "shape") else x for x in leaves))
 
-        asked.forget = of_contents.cache_clear  # type: ignore[attr-defined]
         return asked  # type: ignore[return-value]
 
     return decorated

@@ -31,7 +31,6 @@ def test_equal_arrays_are_asked_about_once():
     double(np.arange(3.0, dtype=np.float32), 2), double(np.arange(3.0).reshape(3, 1), 2)
     assert [x.shape for x in asked] == [(3,), (3,), (3,), (3, 1)]  # neither type nor shape is left out
     assert double(np.arange(3.0), 2) is not first  # the oldest is forgotten
-    double.forget()
     with pytest.raises(ValueError, match="read-only"):
         asked[0][0] = 1.0
 
@@ -47,11 +46,8 @@ def test_prepared_knots_are_shared_and_cannot_be_written_to():
 
 def test_the_reach_at_a_sample_is_found_once(monkeypatch):
     surface, asked = helpers.wavy_surface(9, 8), []
-    net, axes = (
-        np.asarray(surface.control_points),
-        [make_axis(np.asarray(x), 4) for x in (surface.knots_u, surface.knots_v)],
-    )
-    at = Reach._reach_at
+    axes = [make_axis(np.asarray(x), 4) for x in (surface.knots_u, surface.knots_v)]
+    net, at = np.asarray(surface.control_points), Reach._reach_at
 
     def counted(self, number, count):
         asked.extend((count, x) for x in number)
@@ -79,3 +75,15 @@ def test_queries_one_after_the_other_sample_a_surface_once(monkeypatch):
     np.testing.assert_array_equal(found[0].distance, found[1].distance)
     assert abs(found[2].distance - found[0].distance).max() > 1e-4
     assert len(sampled) <= 2
+
+
+def test_fits_from_one_base_find_its_reach_once_however_many_end_in_between(monkeypatch):
+    base, made, reach = helpers.wavy_surface(6, 6), [], Reach.__init__
+    monkeypatch.setattr(Reach, "__init__", lambda self, *args: made.append(args) or reach(self, *args))
+    u, v = RNG.uniform(size=(2, 4000))
+    x, y, z = np.asarray(base(u, v)).T
+    clouds = [np.stack([x, y, z + 0.02 * k * np.sin(9 * x)], axis=1) for k in range(1, 6)]
+    method = jf.GeometricApproximation()
+    for cloud in clouds:
+        jf.approximate(cloud, base, method, tol_average=1e-9, max_steps=2)
+    assert len(made) == 1 + len(clouds)  # the base, and where each fit ended

@@ -67,7 +67,9 @@ class Huber(AbstractLoss):
     ----------
     scale : float, optional
         c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
-        estimated anew in each iteration from the distance that 90 % of the points do not exceed.
+        estimated anew in each iteration from the distance that 90 % of the points do not exceed. Where a
+        tenth of the points or more are outliers, that is their distance, and the surface follows them: pass
+        a scale then, of a few times the noise.
 
     Raises
     ------
@@ -113,9 +115,7 @@ class Tukey(AbstractLoss):
     Parameters
     ----------
     scale : float, optional
-        As for `Huber`, but by default 14 standard deviations. That breaks down where a tenth of the points
-        or more are outliers, and then the surface follows them: pass a scale, some times the noise, and a
-        base surface that is nearer than it.
+        As for `Huber`, but by default 14 standard deviations.
 
     Notes
     -----

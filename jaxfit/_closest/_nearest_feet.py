@@ -60,7 +60,7 @@ def compile_search_ahead(
 
 def _globally(projector: Projector, known: Any, used: tuple[int, int]) -> HostFeet:
     """The nearest foot of all."""
-    search = SurfaceSearch(projector, used)
+    search = SurfaceSearch(projector, used, once=known is not None)
     if known is None:
         best = search.local_feet()
     else:

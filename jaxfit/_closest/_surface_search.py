@@ -22,17 +22,21 @@ LAST_SURFACES = 2  # whose samples are remembered
 
 
 class SurfaceSearch:
-    """Searches the surface of a projector, of whose control points `used` are in use along u and v."""
+    """Searches the surface of a projector, of whose control points `used` are in use along u and v.
 
-    def __init__(self, projector: Projector, used: tuple[int, int]):
-        self.projector = projector
+    What is made of a surface that is searched `once`, as the one a fit ends with, is not remembered.
+    """
+
+    def __init__(self, projector: Projector, used: tuple[int, int], once: bool = False):
+        self.projector, self._once = projector, once
         self.net = projector.net[: used[0], : used[1]]
         self.axes = [_in_use(axis, count) for axis, count in zip(projector.axes, used, strict=True)]
 
     @cached_property
     def samples(self) -> Search:
         """Samples of the surface, made when first asked for: large clouds may do without."""
-        return _search_of(self.net.astype(self.projector.dtype), *self.axes)
+        made = _search_of if self._once else _remembered_search_of
+        return made(self.net.astype(self.projector.dtype), *self.axes)
 
     def local_feet(self, which: Any = None) -> HostFeet:
         """Feet of the points `which` (None: all), found from samples near these."""
@@ -57,7 +61,8 @@ class SurfaceSearch:
         enough = min(POINTS_PER_SAMPLE * number_of_samples(*axes), LEAST_POINTS_PER_CELL * cells)
         if not smooth or self.net.shape[2] != 3 or count < enough:
             return np.arange(count)
-        below = _reach_of(self.net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
+        made = Reach if self._once else _remembered_reach_of
+        below = made(self.net, *axes).exceeds(best["u"], best["v"], np.sqrt(best["f"]))
         return np.flatnonzero(~(below & best["converged"]))
 
     def try_candidates(self, left: np.ndarray, best: HostFeet) -> None:
@@ -84,14 +89,12 @@ class SurfaceSearch:
             take_nearer(best, chosen, self.projector(chosen, u[part], v[part]))
 
 
-@remembered(LAST_SURFACES)
 def _search_of(net: np.ndarray, axis_u: Axis, axis_v: Axis) -> Search:
     return Search(sample(net, axis_u, axis_v))
 
 
-@remembered(LAST_SURFACES)
-def _reach_of(net: np.ndarray, axis_u: Axis, axis_v: Axis) -> Reach:
-    return Reach(net, axis_u, axis_v)
+_remembered_search_of = remembered(LAST_SURFACES)(_search_of)
+_remembered_reach_of = remembered(LAST_SURFACES)(Reach)
 
 
 def search_borders(projector: Projector, best: HostFeet) -> None:

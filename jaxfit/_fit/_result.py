@@ -52,7 +52,8 @@ class Fit(eqx.Module):
     stats : dict
         `num_steps`: iterations; `diagonal`: of the data, in its own unit; `unconverged_feet`: points whose
         foot was not found to the tolerance; `method`, the name of its class. Of an approximation also
-        `tol_average` and `tol_maximum`, infinite where none was given. Of an interpolation also the
+        `tol_average` and `tol_maximum`, infinite where none was given, and `loss`, the name of the class of
+        the method's loss, if it has one. Of an interpolation also the
         `tolerance` in force, and of one with symmetry `asymmetry`: the largest
         distance between a data point and the mirror image of its partner, as a fraction of the diagonal.
         Methods add further entries, which their docstrings describe.

@@ -83,6 +83,6 @@ def _check_no_tube(points: np.ndarray, loops: list[np.ndarray], area: float) -> 
     if small > TUBE_ENDS * large and area > TUBE_AREA * (large - small):
         raise ValueError(
             "points must make a sheet that can be laid out flat, but their surface runs round like a tube; "
-            "cut it open along a line from one end to the other, lower hole_length if there is a gap, or fit "
-            "parts."
+            "cut it open along a line from one end to the other, lower hole_length if it has a gap there, or "
+            "fit parts."
         )

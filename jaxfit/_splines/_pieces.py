@@ -113,8 +113,9 @@ def make_axis(knots: Float[Numbers, " knots"], order: int, simple: bool = False)
     Concrete knots are dealt with by NumPy, so that nothing compiles. Of others it has to be assumed that they
     repeat, unless interior knots are known to be `simple`.
     """
-    prepare = _axis_on_host if is_concrete(knots) else _axis
-    return prepare(knots, order, simple)
+    if is_concrete(knots):
+        return _axis_on_host(np.asarray(knots), order, simple)
+    return _axis(knots, order, simple)
 
 
 def _axis(knots: Float[Numbers, " knots"], order: int, simple: bool) -> Axis:
@@ -163,8 +164,8 @@ def _axis(knots: Float[Numbers, " knots"], order: int, simple: bool) -> Axis:
 
 
 @remembered(LAST_KNOTS)
-def _axis_on_host(knots: Any, order: Any, simple: Any) -> Axis:
-    axis = _axis(knots, int(order), bool(simple))
+def _axis_on_host(knots: Float[np.ndarray, " knots"], order: int, simple: bool) -> Axis:
+    axis = _axis(knots, order, simple)
     for array in jax.tree.leaves(axis):
         array.flags.writeable = False  # for it is shared
     return axis

@@ -152,7 +152,7 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
             f"{path}: points has shape {array.shape}; it must be (N, 3), or a grid (n, m, 3) if these are "
             "heights."
         )
-    if key == "grid" and array.ndim == 3 and (3 in array.shape[:2] or array.shape[2] > MOST_COLUMNS):
+    if key == "grid" and array.ndim == 3:
         _check_coordinates_last(array.shape, path)
     array = _coordinates(array, key, ndim, shape, path)
     if array.size < 3 * _LEAST_POINTS:
@@ -166,11 +166,14 @@ def _from_array(array: np.ndarray, key: str, path: Path) -> PointData:
 
 
 def _check_coordinates_last(shape: tuple[int, ...], path: Path) -> None:
-    """Raise for a grid whose last axis holds more than three, where another one may be the coordinates'."""
-    if shape[2] > 3:
-        axis = shape.index(3) if 3 in shape[:2] else None
-        remedy = "(n, m, 3)" if axis is None else f"(n, m, 3): store np.moveaxis(grid, {axis}, -1)"
-        raise InputError(f"{path}: grid has shape {shape}; it must be {remedy}.")
+    """Raise for a grid with more than coordinates on its last axis, if another has three, or too many."""
+    if shape[2] > 3 and 3 in shape[:2]:
+        turned = f": store np.moveaxis(grid, {shape.index(3)}, -1)"
+    elif shape[2] > MOST_COLUMNS:
+        turned = ""
+    else:
+        return
+    raise InputError(f"{path}: grid has shape {shape}; it must be (n, m, 3){turned}.")
 
 
 def _coordinates(
