@@ -51,6 +51,26 @@ def test_the_scale_follows_from_the_points(loss):
     assert float(fixed.length(error, real, jnp.asarray(3.0))) == pytest.approx(0.06)
 
 
+@pytest.mark.parametrize("share, most", [(0.1, 1.5), (0.2, 2.0), (0.3, 2.6)])
+def test_a_share_of_outliers_does_not_become_the_scale(share, most):
+    rng = np.random.default_rng(0)
+    error = np.abs(rng.normal(size=4000)) * 0.01
+    error[: int(share * 4000)] = rng.uniform(1, 2, int(share * 4000))
+    length = jf.Tukey().length(error, np.full(4000, True), jnp.asarray(3.0))
+    assert 0.01 < float(length) / jf.Tukey.width < most * 0.01
+
+
+@pytest.mark.parametrize("loss", LOSSES, ids=named)
+def test_a_fifth_of_outliers_hardly_moves_a_surface(loss, base):
+    points, rng = wavy_cloud(2000)[0], np.random.default_rng(3)
+    wild = points.copy()
+    wild[:400] = points.min(axis=0) + np.ptp(points, axis=0) * rng.uniform(-0.1, 1.1, (400, 3))
+    fit = jf.approximate(wild, base, jf.OrthogonalDistance(loss=loss), tol_average=0.0, max_steps=40)
+    distance = np.asarray(jf.closest_point(fit.surface, points).distance) / diagonal(points)
+    assert distance.mean() < 1e-4
+    assert fit.regularity.folds == 0
+
+
 def test_least_squares_is_no_loss_at_all():
     weight, error = jnp.ones(3), jnp.arange(3.0)
     assert reweighted(None, None, weight, error) is weight
