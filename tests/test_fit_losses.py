@@ -1,5 +1,7 @@
 """Robust losses: their weights are the derivatives of their costs, and outliers do not spoil a fit."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -51,7 +53,7 @@ def test_the_scale_follows_from_the_points(loss):
     assert float(fixed.length(error, real, jnp.asarray(3.0))) == pytest.approx(0.06)
 
 
-@pytest.mark.parametrize("share, most", [(0.1, 1.5), (0.2, 2.0), (0.3, 2.6)])
+@pytest.mark.parametrize(("share", "most"), [(0.1, 1.5), (0.2, 2.0), (0.3, 2.6)])
 def test_a_share_of_outliers_does_not_become_the_scale(share, most):
     rng = np.random.default_rng(0)
     error = np.abs(rng.normal(size=4000)) * 0.01
@@ -144,3 +146,19 @@ def test_impossible_scales_get_a_sentence(kind, scale):
 def test_a_loss_of_another_kind_gets_a_sentence(kind):
     with pytest.raises(TypeError, match="loss must be an object"):
         kind(loss="huber")
+
+
+@pytest.mark.parametrize("kind", [jf.OrthogonalDistance, partial(jf.StandardApproximation, 1e-9)])
+def test_a_border_that_is_met_exactly_does_not_hold_the_rest(kind):
+    # Its points count in full, all others a hundred millionth of that.
+    line, zero = np.linspace(0, 1, 40), np.zeros(40)
+    sides = [
+        np.stack(side, axis=1) for side in ((line, zero), (line, zero + 1), (zero, line), (zero + 1, line))
+    ]
+    border = [np.column_stack([side, zero]) for side in sides]
+    x, y = np.random.default_rng(0).uniform(0.05, 0.95, (2, 800))
+    inner = np.stack([x, y, 0.1 * np.sin(np.pi * x) * np.sin(np.pi * y)], axis=1)
+    base = jf.base_surface(jf.Boundary(*border), net=(8, 8))
+    points = np.concatenate([*border, inner])
+    fit = jf.approximate(points, base, kind(loss=jf.Huber(1e-9)), tol_average=0.0, max_steps=30)
+    assert float(fit.average_error) < 1e-3

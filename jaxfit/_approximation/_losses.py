@@ -19,9 +19,9 @@ from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 
 # The scale follows from the distances that these SHARES of the points do not exceed: of normally distributed
-# residuals along a normal so many standard DEVIATIONS. The first alone would be the distance of outliers where
-# they are a tenth, the last alone would remove detail that a fit has not reached yet. On scans without
-# outliers the first is seldom more than TAILS times the others.
+# residuals along a normal so many standard DEVIATIONS. The first alone would be the distance of outliers
+# where they are a tenth, the last alone would remove detail that a fit has not reached yet. On scans without
+# outliers the first is seldom much more than TAILS times the others.
 SHARES, DEVIATIONS, TAILS = (0.9, 0.75, 0.5), (1.6449, 1.1503, 0.6745), (1.0, 1.2, 1.6)
 
 

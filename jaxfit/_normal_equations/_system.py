@@ -30,7 +30,7 @@ from jaxfit._normal_equations._thin_plate import Bending, ThinPlate, thin_plate
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 from jaxfit._unrolling import constant, without_influence
 
-LEAST_INFLUENCE = 1e-5  # of the greatest diagonal entry: control points reached by less stay
+LEAST_INFLUENCE = 1e-5  # of the greatest diagonal entry to solve for: control points reached by less stay
 
 Residual = tuple[Float[Array, "d rows width"], Bending]
 
@@ -126,5 +126,5 @@ def free_points(stencil: Stencil, held: Bool[Any, "nu nv"]) -> Bool[Array, "nu n
     The others keep their value: those that data touches at most with the far end of a basis function when
     there is no smoothing, and would throw anywhere, and surplus ones behind repeated end knots.
     """
-    reached = jnp.asarray(stencil.diagonal)
-    return (reached > LEAST_INFLUENCE * jnp.max(reached)) & ~jnp.asarray(held)
+    reached, held = jnp.asarray(stencil.diagonal), jnp.asarray(held)
+    return ~held & (reached > LEAST_INFLUENCE * jnp.max(reached * ~held))
