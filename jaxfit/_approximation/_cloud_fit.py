@@ -71,7 +71,8 @@ def fit_cloud(
     if concrete and is_concrete(given):  # or else the method may have no derivative
         programs_ahead(method, problem, begun, cloud.shape[0], request, room)
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, method, room))
-    order = order_by_cell(begun, u, v, cloud.shape[0], method.finds_feet)
+    sorts = method.finds_feet or getattr(method, "loss", None) is not None  # whose scale looks at neighbours
+    order = order_by_cell(begun, u, v, cloud.shape[0], sorts)
     if not is_concrete(order):
         u, v = jnp.asarray(u), jnp.asarray(v)
     together = problem.ordered(order)
@@ -207,16 +208,16 @@ def _padded(x: Any, size: int, dtype: Any) -> Any:
     return xp.concatenate([x, xp.repeat(x[-1:], size - x.shape[0])]) if size > x.shape[0] else x
 
 
-def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int, often: bool = True) -> Any:
+def order_by_cell(surface: WorkingSurface, u: Any, v: Any, count: int, sorts: bool = True) -> Any:
     """The points sorted by cell, on the host by rectangles of a uniform grid, the `count` true ones first.
 
-    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster. Sorting does
-    not pay unless that is done `often`: points on the host then keep their order.
+    Neighbours in memory are then neighbours on the surface, and `_cells` lays them out faster. Where that is
+    done but once it does not pay: unless it `sorts`, points on the host keep their order.
     """
     axis_u, axis_v = surface.axes
     if is_concrete(surface.axes, u, v):
         given = np.arange(u.shape[0])
-        together = neighbours_together(surface.axes, u[:count], v[:count]) if often else given[:count]
+        together = neighbours_together(surface.axes, u[:count], v[:count]) if sorts else given[:count]
         return np.append(together, given[count:])
     cells = axis_u.cells * axis_v.cells
     cell = axis_u.locate(u) * axis_v.cells + axis_v.locate(v)

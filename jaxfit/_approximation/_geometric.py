@@ -195,7 +195,8 @@ class GeometricApproximation(AbstractIterativeMethod):
         extrapolation = state.extrapolation
         if extrapolation is not None:
             extrapolation = extrapolation.after(jnp.stack([feet.u - before.u, feet.v - before.v]))
-        weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
+        length = loss_length(self.loss, problem, iterate.surface.axes, error)
+        weight = reweighted(self.loss, length, problem.weight, error)
         active = jnp.sum((weight > 0) & ~resting, dtype=jnp.int32)
         exceeded = state.exceeded
         if self.local:
@@ -227,7 +228,8 @@ class GeometricApproximation(AbstractIterativeMethod):
             u, v = state.extrapolation.predict((pieces.axis_u, pieces.axis_v), u, v)
 
         def update(u: Array, v: Array, error: Array) -> tuple[FootUpdate, WeightedErrors]:
-            weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, error))
+            axes = pieces.axis_u, pieces.axis_v
+            weigh = partial(reweighted, self.loss, loss_length(self.loss, problem, axes, error))
             return update_feet(
                 self.foot_method,
                 pieces,
@@ -303,7 +305,8 @@ class GeometricApproximation(AbstractIterativeMethod):
                 "a fit with local=True has no derivative, since some control points stay where they are; "
                 "pass local=False."
             )
-        weight = reweighted(self.loss, loss_length(self.loss, problem, error), problem.weight, error)
+        length = loss_length(self.loss, problem, surface.axes, error)
+        weight = reweighted(self.loss, length, problem.weight, error)
         held = held_points(self.border, surface.control_points.shape, surface.used)
         return Stationarity(weight, held)
 

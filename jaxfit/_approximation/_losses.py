@@ -10,19 +10,21 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from equinox import AbstractClassVar
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._fit._problem import Problem
+from jaxfit._splines._pieces import Axis
 
-# The scale follows from the distances that these SHARES of the points do not exceed: of normally distributed
-# residuals along a normal so many standard DEVIATIONS. The first alone would be the distance of outliers
-# where they are a tenth, the last alone would remove detail that a fit has not reached yet. On scans without
-# outliers the first is seldom much more than TAILS times the others.
-SHARES, DEVIATIONS, TAILS = (0.9, 0.75, 0.5), (1.6449, 1.1503, 0.6745), (1.0, 1.2, 1.6)
+# The scale follows from medians of neighbours: a median knows little of outliers among other points, and much
+# of a place that a fit has not reached yet. A group is of so many points, or of two cells if that is more:
+# points are sorted by cell, and in each of them outliers may come first.
+TOGETHER, CELLS = 25, 2
+# It is the median that this share of them do not exceed. With normally distributed residuals along a normal
+# that is so many standard deviations, and so many more over the root of the number of points in a group.
+SHARE, MEDIAN, SPREAD = 0.9, 0.6745, 1.05
 
 
 class AbstractLoss(eqx.Module):
@@ -48,17 +50,13 @@ class AbstractLoss(eqx.Module):
     def derivative(self, square: Array) -> Array:
         """rho'(x), between 0 and 1."""
 
-    def length(self, error: Any, real: Any, diagonal: Any) -> Float[Array, ""]:
-        """The scale as a length; without one, from the errors of `real` points."""
+    def length(self, error: Any, real: Any, diagonal: Any, cells: Any) -> Float[Array, ""]:
+        """The scale as a length; without one, from the errors of `real` points, sorted by cell."""
         error = jnp.asarray(error)
         if self.scale is not None:
             return jnp.asarray(self.scale, error.dtype) * diagonal
-        ordered = jnp.sort(jnp.where(real, error, jnp.inf))
-        place = jnp.sum(real, dtype=error.dtype) * np.asarray(SHARES, error.dtype)
-        place = jnp.clip(place.astype(jnp.int32), 0, error.shape[0] - 1)
-        deviations = ordered[place] * np.divide(TAILS, DEVIATIONS).astype(error.dtype)
         least = jnp.finfo(error.dtype).eps * diagonal
-        return jnp.maximum(self.width * jnp.min(deviations), least)
+        return jnp.maximum(self.width * _deviation(error, jnp.asarray(real), cells), least)
 
 
 class Huber(AbstractLoss):
@@ -70,9 +68,10 @@ class Huber(AbstractLoss):
     ----------
     scale : float, optional
         c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
-        estimated anew in each iteration: the least of what the distances say that 90 % of the points do not
-        exceed, 1.2 times what 75 % say, and 1.6 times what half of them say. So up to a tenth of outliers
-        changes it little; of more than a third, pass a scale of a few times the noise.
+        estimated anew in each iteration: the median distance of 25 neighbours or more that 90 % of such
+        medians do not exceed. So outliers among other points change it little as long as they are a fifth or
+        less. Where there are more, pass a scale of a few times the noise; also where a feature takes up less
+        than a tenth of a surface that is met elsewhere, or its points are taken for outliers.
 
     Raises
     ------
@@ -178,9 +177,27 @@ def check_loss(loss: Any) -> None:
         check_kind("loss", loss, AbstractLoss, "Huber(), Tukey() or GemanMcClure()")
 
 
-def loss_length(loss: AbstractLoss | None, problem: Problem, error: Any) -> Any:
+def loss_length(loss: AbstractLoss | None, problem: Problem, axes: tuple[Axis, Axis], error: Any) -> Any:
     """The scale of a loss as a length, from the errors if it has none; None for least squares."""
-    return None if loss is None else loss.length(error, problem.counted, problem.diagonal)
+    if loss is None:
+        return None
+    cells = [axis.ends[1] - axis.ends[0] + 1 for axis in axes]
+    return loss.length(error, problem.counted, problem.diagonal, cells[0] * cells[1])
+
+
+def _deviation(error: Array, real: Array, cells: Any) -> Float[Array, ""]:
+    """The standard deviation of residuals where it is large. Points that are not `real` change nothing."""
+    until = jnp.cumsum(real, dtype=jnp.int32)
+    size = jnp.maximum(-(-CELLS * until[-1] // cells), TOGETHER)
+    count = jnp.maximum(until[-1] // size, 1)
+    group = jnp.where(real, jnp.minimum((until - 1) // size, count - 1), error.shape[0])
+    _, ordered = lax.sort((group, error), num_keys=2)
+    number = jnp.arange(max(error.shape[0] // TOGETHER, 1), dtype=jnp.int32)
+    start = number * size
+    middle = (start + jnp.where(number == count - 1, until[-1], start + size)) // 2
+    medians = jnp.sort(jnp.where(number < count, ordered.at[middle].get(mode="clip"), jnp.inf))
+    usual = MEDIAN + SPREAD * lax.rsqrt(size.astype(error.dtype))
+    return medians[(SHARE * count.astype(error.dtype)).astype(jnp.int32)] / usual
 
 
 def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:

@@ -225,7 +225,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         surface, state, before = iterate.surface, iterate.state, iterate.projection
         here = measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
         # Both surfaces are compared with the same scale of the loss.
-        length = loss_length(self.loss, problem, before.error)
+        length = loss_length(self.loss, problem, surface.axes, before.error)
         cost = jax.vmap(partial(total_cost, self.loss, length, problem.weight))
         longest = farthest_move(surface.axes, (before.u, before.v), (here.u, here.v), problem.counted)
         sums = StepSums(cost(jnp.stack([before.error, here.error])), problem.by_device(longest))
@@ -268,7 +268,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         surface, guard = self._refined(problem, iterate)
         damping = state.damping.damping
         net, axes = surface.control_points, surface.axes
-        length = loss_length(self.loss, problem, here.error)
+        length = loss_length(self.loss, problem, surface.axes, here.error)
         weight = reweighted(self.loss, length, problem.weight, here.error)
         held = held_points(self.border, net.shape, surface.used)
         longest = longest_moves(jnp.asarray(net), self.reach, surface.used)
@@ -314,7 +314,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         self, problem: Problem, surface: WorkingSurface, state: OrthogonalState, error: Array
     ) -> Stationarity:
         """Half the gradient of F. Factors of RegularSmoothing count as constant, but for those at `least`."""
-        length = loss_length(self.loss, problem, error)
+        length = loss_length(self.loss, problem, surface.axes, error)
         if state.guard is None:
             smoothing = as_smoothing(self.smoothing, error.dtype) * jnp.sum(problem.weight)
             penalty: AbstractPenalty = WeightedPlate(plate_of(state.plate, surface), smoothing)

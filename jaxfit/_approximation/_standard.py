@@ -157,7 +157,7 @@ class StandardApproximation(AbstractIterativeMethod):
         plate: ThinPlate | None = None,
     ) -> RegularisedSystem:
         """The least-squares problem at the present parameters."""
-        length = loss_length(self.loss, problem, projection.error)
+        length = loss_length(self.loss, problem, surface.axes, projection.error)
         weight = reweighted(self.loss, length, problem.weight, projection.error)
         parameters = projection.u, projection.v
         return make_system(surface.pieces, *parameters, problem.target, weight, smoothing, plate)
@@ -199,7 +199,7 @@ class StandardApproximation(AbstractIterativeMethod):
         self, problem: Problem, surface: WorkingSurface, state: StandardState, error: Array
     ) -> Stationarity:
         """Half the gradient of F. A lambda chosen from the data counts as constant."""
-        length = loss_length(self.loss, problem, error)
+        length = loss_length(self.loss, problem, surface.axes, error)
         chosen = isinstance(self.smoothing, AbstractSmoothing)
         smoothing = state.smoothing if chosen else as_smoothing(self.smoothing, error.dtype)
         penalty = WeightedPlate(plate_of(state.plate, surface), jnp.asarray(smoothing))
