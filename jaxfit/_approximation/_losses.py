@@ -14,6 +14,7 @@ from equinox import AbstractClassVar
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxfit._cells import take
 from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._fit._problem import Problem
 from jaxfit._splines._pieces import Axis
@@ -70,8 +71,10 @@ class Huber(AbstractLoss):
         c, as a fraction of the diagonal of the data's bounding box. By default 1.345 standard deviations,
         estimated anew in each iteration: the median distance of 25 neighbours or more that 90 % of such
         medians do not exceed. So outliers among other points change it little as long as they are a fifth or
-        less. Where there are more, pass a scale of a few times the noise; also where a feature takes up less
-        than a tenth of a surface that is met elsewhere, or its points are taken for outliers.
+        less; `StandardApproximation` and `GeometricApproximation` may follow so many all the same, since they
+        come near to all points before the scale has fallen. Where there are more, pass a scale of a few times
+        the noise; also where a feature takes up less than a tenth of a surface that is met elsewhere, or its
+        points are taken for outliers.
 
     Raises
     ------
@@ -188,16 +191,17 @@ def loss_length(loss: AbstractLoss | None, problem: Problem, axes: tuple[Axis, A
 def _deviation(error: Array, real: Array, cells: Any) -> Float[Array, ""]:
     """The standard deviation of residuals where it is large. Points that are not `real` change nothing."""
     until = jnp.cumsum(real, dtype=jnp.int32)
-    size = jnp.maximum(-(-CELLS * until[-1] // cells), TOGETHER)
-    count = jnp.maximum(until[-1] // size, 1)
-    group = jnp.where(real, jnp.minimum((until - 1) // size, count - 1), error.shape[0])
+    total, cells = until[error.shape[0] - 1], jnp.asarray(cells, jnp.int32)
+    size = jnp.maximum(lax.div(CELLS * total + cells - 1, cells), TOGETHER)
+    count = jnp.maximum(lax.div(total, size), 1)
+    group = jnp.where(real, jnp.minimum(lax.div(until - 1, size), count - 1), error.shape[0])
     _, ordered = lax.sort((group, error), num_keys=2)
     number = jnp.arange(max(error.shape[0] // TOGETHER, 1), dtype=jnp.int32)
     start = number * size
-    middle = (start + jnp.where(number == count - 1, until[-1], start + size)) // 2
-    medians = jnp.sort(jnp.where(number < count, ordered.at[middle].get(mode="clip"), jnp.inf))
+    middle = (start + jnp.where(number == count - 1, total, start + size)) >> 1
+    medians = jnp.where(number < count, take(ordered, jnp.minimum(middle, error.shape[0] - 1), 0), jnp.inf)
     usual = MEDIAN + SPREAD * lax.rsqrt(size.astype(error.dtype))
-    return medians[(SHARE * count.astype(error.dtype)).astype(jnp.int32)] / usual
+    return take(jnp.sort(medians), (SHARE * count.astype(error.dtype)).astype(jnp.int32), 0) / usual
 
 
 def reweighted(loss: AbstractLoss | None, length: Any, weight: Any, error: Any) -> Any:
