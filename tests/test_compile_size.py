@@ -14,10 +14,12 @@ START = RNG.random(500), RNG.random(500)
 
 
 BASE = jf.BSplineSurface(np.random.default_rng(1).random((9, 9, 3)), KNOTS, KNOTS)
+FINE = clamped_uniform(26, 4)  # a net too large to be solved by its factors
+FINE_BASE = jf.BSplineSurface(np.random.default_rng(1).random((26, 26, 3)), FINE, FINE)
 
 
-def approximated(method):
-    return lambda points: jf.approximate(points, BASE, method, start=START).surface.control_points
+def approximated(method, base=BASE):
+    return lambda points: jf.approximate(points, base, method, start=START).surface.control_points
 
 
 def interpolated(method):
@@ -30,6 +32,7 @@ ENTRIES = {
     "approximate, paper": (approximated(jf.GeometricApproximation.paper()), POINTS, 2380),
     "approximate, standard": (approximated(jf.StandardApproximation(smoothing=1e-5)), POINTS, 2500),
     "approximate, orthogonal": (approximated(jf.OrthogonalDistance()), POINTS, 4450),
+    "approximate, orthogonal, fine net": (approximated(jf.OrthogonalDistance(), FINE_BASE), POINTS, 4450),
     "closest_point": (lambda points: jf.closest_point(BASE, points).u, POINTS, 1840),
     "interpolate, geometric": (GEOMETRIC, GRID, 2500),
     "interpolate, geometric, gradient": (jax.grad(lambda grid: GEOMETRIC(grid).sum()), GRID, 5000),

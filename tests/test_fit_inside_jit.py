@@ -71,6 +71,14 @@ def test_points_weights_and_tolerances_of_clouds_may_be_traced(method, known):
     assert abs(float(jax.jit(error)(*arguments)) - float(error(*arguments))) < 1e-9
 
 
+def test_many_steps_of_orthogonal_distance_on_a_small_net_do_not_depend_on_rounding():
+    def net(points):
+        options = dict(tol_average=0.0, max_steps=20)
+        return jf.approximate(points, BASE, **options).surface.control_points
+
+    np.testing.assert_allclose(jax.jit(net)(jnp.asarray(POINTS)), net(POINTS), rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize("method", [jf.StandardInterpolation(), jf.GeometricApproximation()], ids=name)
 def test_single_and_half_precision_are_fitted_in_the_sessions_own(method):
     data = GRID if isinstance(method, jf.StandardInterpolation) else POINTS

@@ -21,7 +21,7 @@ from jaxfit._approximation._second_order import second_order_rhs
 from jaxfit._fit._problem import Tolerances, make_problem
 from jaxfit._fit._scaling import unit_of
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._normal_equations import coupled_preconditioner, solve_coupled
+from jaxfit._normal_equations import _coupled_preconditioner, coupled_preconditioner, solve_coupled
 from jaxfit._splines._pieces import pieces_on
 
 POINTS, EDGES = wavy_cloud(500)
@@ -119,17 +119,27 @@ def test_full_damping_is_the_matrix_at_fixed_parameters(laid_out):
     assert np.abs(np.asarray(got.entries - expected)).max() < 1e-12
 
 
-def test_conjugate_gradients_solve_the_coupled_system(laid_out):
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("factored", [False, True], ids=["large net", "small net"])
+def test_the_coupled_system_is_solved(laid_out, factored, turned, monkeypatch):
+    monkeypatch.setattr(_coupled_preconditioner, "FACTORED_SIDE", 24 if factored else 0)
     _, net, _, rows = laid_out
     got = rows(0.1)
-    matrix, free = got.matrix, jnp.zeros(net.shape[:2], bool).at[1:-1, 1:-1].set(True)
+    matrix, right = got.matrix, got.gradient
+    if turned:
+        matrix, right, net = matrix.transposed(), right.swapaxes(0, 1), net.swapaxes(0, 1)
+    free = jnp.zeros(net.shape[:2], bool).at[1:-1, 1:-1].set(True)
     near = coupled_preconditioner(matrix, matrix.trace, free)
-    solution = jax.jit(lambda m, r: solve_coupled(m, r, free, near, 1e-12, 500).net)(matrix, got.gradient)
+    solution = jax.jit(lambda m, r: solve_coupled(m, r, free, near, 1e-12, 500))(matrix, right)
     number = np.arange(net.size).reshape(net.shape)[1:-1, 1:-1].ravel()
     dense = np.asarray(matrix.dense())[np.ix_(number, number)]
-    exact = np.linalg.solve(dense, np.asarray(got.gradient).reshape(-1)[number])
-    assert np.abs(np.asarray(solution).reshape(-1)[number] - exact).max() < 1e-8 * np.abs(exact).max()
-    assert not np.asarray(solution)[0].any()
+    exact = np.linalg.solve(dense, np.asarray(right).reshape(-1)[number])
+    assert np.abs(np.asarray(solution.net).reshape(-1)[number] - exact).max() < 1e-8 * np.abs(exact).max()
+    assert not np.asarray(solution.net)[0].any()
+    if factored:
+        direct = near(right)
+        assert np.abs(np.asarray(direct).reshape(-1)[number] - exact).max() < 1e-10 * np.abs(exact).max()
+        assert int(solution.steps) <= 2
 
 
 def objective(fit, surface, errors):

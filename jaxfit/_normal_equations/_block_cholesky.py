@@ -1,13 +1,15 @@
 """Cholesky factors of a stencil, kept without roots, one row of the net at a time: S = X D X^T.
 
 Numbered row by row the matrix is block-banded: a row of the net is coupled with the K - 1 next ones. Each
-step inverts the nv x nv block D of one row and takes what it leaves off a window of K - 1 rows to come, so
-that nearly all the work is a few products of matrices a step, and nothing outside the band is touched.
+step inverts the block D of one row, n x n, and takes what it leaves off a window of K - 1 rows to come, so
+that nearly all the work is a few products of matrices a step, and nothing outside the band is touched. Here n
+is nv, or d nv where the matrix couples the d coordinates: then a row has all first ones, all second ones, ...
 
 The blocks are inverted here. A call to LAPACK for each would be no faster, and its threads wait for one
 another so badly where cores are shared that it may be a hundred times slower.
 """
 
+from math import isqrt
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +18,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
+from jaxfit._normal_equations._coupled_stencil import CoupledStencil
 from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._varying import as_varying
 
@@ -41,19 +44,22 @@ class Factors(eqx.Module):
     transposed: bool = eqx.field(static=True)
 
 
-def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
+def factorise(stencil: Stencil | CoupledStencil, free: Bool[Array, "nu nv"]) -> Factors:
     """Factors of the matrix restricted to the free control points, the others having identity rows.
 
     A matrix that is nearly singular is shifted by a small multiple of its diagonal. Time
-    O(rows (K n)^2 n) and memory O(rows K n^2), n being the shorter side of the net.
+    O(rows (K n)^2 n) and memory O(rows K n^2), nv being the shorter side of the net.
     """
     transposed = free.shape[1] > free.shape[0]
     if transposed:
         stencil, free = stencil.transposed(), free.T
-    entries = jnp.asarray(stencil.entries)
+    nu, nv = free.shape
+    order_u, order_v = stencil.entries.shape[-4:-2]
+    entries = jnp.asarray(stencil.entries).reshape(-1, order_u, order_v, nu, nv)
+    d = isqrt(entries.shape[0])  # every coordinate with every other
+    free = jnp.concatenate([free] * d, axis=1)
     eps = float(jnp.finfo(entries.dtype).eps)
     smallest, added = max(LEAST_PIVOT, ROUNDING[0] * eps), max(SHIFT, ROUNDING[1] * eps)
-    nu, nv = free.shape
 
     def failed(carry: tuple[Any, Array, Array]) -> Array:
         (_, least), _, trials = carry
@@ -65,7 +71,7 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
         return _factors(entries, free, shift), shift, trials + 1
 
     zero = jnp.zeros((), entries.dtype)
-    blocks = (jnp.zeros((nu, entries.shape[0] * nv, nv), entries.dtype), zero)
+    blocks = (jnp.zeros((nu, order_u * d * nv, d * nv), entries.dtype), zero)
     begin = as_varying((blocks, zero, jnp.asarray(0, jnp.int32)), entries, free)
     (blocks, _), shift, _ = lax.while_loop(failed, attempt, begin)
     return Factors(blocks, shift, transposed)
@@ -73,32 +79,34 @@ def factorise(stencil: Stencil, free: Bool[Array, "nu nv"]) -> Factors:
 
 def _factors(entries: Array, free: Array, shift: Array) -> tuple[Array, Array]:
     """Blocks of the factors, and the least pivot as a share of its diagonal entry."""
-    order, _, nu, nv = entries.shape
-    reach = (order - 1) * nv
+    order, (nu, n) = entries.shape[1], free.shape
+    reach = (order - 1) * n
     ahead = jnp.pad(free, ((0, order - 1), (0, 0)))
-    unit = jnp.eye(nv, dtype=entries.dtype)
-    floor = FLOOR * jnp.max(entries[0, 0])
+    unit = jnp.eye(n, dtype=entries.dtype)
+    with_themselves = range(0, entries.shape[0], isqrt(entries.shape[0]) + 1)
+    diagonal = jnp.concatenate([entries[p, 0, 0] for p in with_themselves], axis=1)
+    floor = FLOOR * jnp.max(diagonal)
 
-    def step(window: list[Array], row: tuple[Array, Array]) -> tuple[list[Array], tuple[Array, ...]]:
-        number, bands = row
+    def step(window: list[Array], row: tuple[Array, ...]) -> tuple[list[Array], tuple[Array, ...]]:
+        number, bands, diagonal = row
         mask = lax.dynamic_slice_in_dim(ahead, number, order)
         column = jnp.where(mask[:, :, None] & mask[0][None, None, :], _blocks(bands), 0.0)
-        added = shift * unit * jnp.maximum(bands[0, 0], floor)[:, None]
+        added = shift * unit * jnp.maximum(diagonal, floor)[:, None]
         own = jnp.where(mask[0][:, None], column[0] + added, unit)
-        rest = column[1:].reshape(reach, nv) - _with_row_below(window[0][nv:])
-        root, least = _inverse_root(own - window[0][:nv], jnp.diagonal(own))
+        rest = column[1:].reshape(reach, n) - _with_row_below(window[0][n:])
+        root, least = _inverse_root(own - window[0][:n], jnp.diagonal(own))
         half = rest @ root.T
-        after = [half[j * nv :] @ half[j * nv : (j + 1) * nv].T for j in range(order - 1)]
+        after = [half[j * n :] @ half[j * n : (j + 1) * n].T for j in range(order - 1)]
         kept = [_with_row_below(x) for x in window[1:]]
         after = [x + y for x, y in zip(kept, after, strict=False)] + after[order - 2 :]
         return after, (jnp.concatenate([root.T, -half]) @ root, least)
 
     def _with_row_below(x: Array) -> Array:
-        return jnp.pad(x, ((0, nv), (0, 0)))
+        return jnp.pad(x, ((0, n), (0, 0)))
 
-    rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(2, 0, 1, 3))
+    rows = (jnp.arange(nu, dtype=jnp.int32), entries.transpose(3, 1, 0, 2, 4), diagonal)
     # What is taken off the rows to come: by columns of blocks, from the diagonal down.
-    window = [jnp.zeros((reach - j * nv, nv), entries.dtype) for j in range(order - 1)]
+    window = [jnp.zeros((reach - j * n, n), entries.dtype) for j in range(order - 1)]
     _, (blocks, least) = lax.scan(step, as_varying(window, entries, free, shift), rows)
     return blocks, jnp.min(least)
 
@@ -134,24 +142,29 @@ def _inverse_root(block: Float[Array, "n n"], size: Float[Array, " n"]) -> tuple
     return lower * lax.rsqrt(jnp.maximum(pivots, smallest * scale)), jnp.min(pivots / scale)
 
 
-def _blocks(bands: Float[Array, "K L n"]) -> Float[Array, "K n n"]:
-    """Dense symmetric blocks from their bands, `bands[:, b, j]` standing at (j, j + b) and (j + b, j)."""
-    blocks, order, count = bands.shape
-    i, j = np.indices((count, count), np.int32)
+def _blocks(bands: Float[Array, "K pairs L nv"]) -> Float[Array, "K n n"]:
+    """Dense symmetric blocks from their bands, `bands[:, p, b, j]` standing at (j, j + b) and (j + b, j) of
+    the part for the pair p of coordinates.
+    """
+    blocks, pairs, order, count = bands.shape
+    d = isqrt(pairs)
+    p, i, q, j = (x.reshape(d * count, d * count) for x in np.indices((d, count, d, count), np.int32))
     # Entries farther from the diagonal are read from the zeros behind the bands.
-    place = np.where(abs(i - j) < order, abs(i - j) * count + np.minimum(i, j), order * count)
-    flat = jnp.pad(bands.reshape(blocks, order * count), ((0, 0), (0, 1)))
+    near = ((d * p + q) * order + abs(i - j)) * count + np.minimum(i, j)
+    place = np.where(abs(i - j) < order, near, pairs * order * count)
+    flat = jnp.pad(bands.reshape(blocks, pairs * order * count), ((0, 0), (0, 1)))
     return jnp.take(flat, place, axis=1, mode="clip")
 
 
 def substitute(factors: Factors, right: Float[Array, "c nu nv"]) -> Float[Array, "c nu nv"]:
     """The solution with the factors, forward and backward, the channels first; control points not free get
-    their right side.
+    their right side. Channels that the matrix couples are its coordinates.
     """
     by_rows = (2, 0, 1) if factors.transposed else (1, 0, 2)
     right = right.transpose(by_rows)
-    channels, count = right.shape[1:]
-    reach = factors.inverse_and_below.shape[1] - count
+    shape, count = right.shape, factors.inverse_and_below.shape[2]
+    right = right.reshape(shape[0], -1, count)
+    channels, reach = right.shape[1], factors.inverse_and_below.shape[1] - count
 
     def forward(window: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         blocks, value = row
@@ -166,4 +179,4 @@ def substitute(factors: Factors, right: Float[Array, "c nu nv"]) -> Float[Array,
     none = as_varying(jnp.zeros((channels, reach), right.dtype), factors, right)
     _, half = lax.scan(forward, none, (factors.inverse_and_below, right))
     _, whole = lax.scan(backward, none, (factors.inverse_and_below, half), reverse=True)
-    return whole.transpose(np.argsort(by_rows))
+    return whole.reshape(shape).transpose(np.argsort(by_rows))

@@ -1,4 +1,6 @@
-"""A preconditioner for coupled normal matrices: an uncoupled factor in rotated frames."""
+"""A preconditioner for coupled normal matrices: their own factors on small nets, else an uncoupled factor in
+rotated frames.
+"""
 
 from functools import partial, reduce
 from operator import add
@@ -16,6 +18,9 @@ from jaxfit._normal_equations._stencil import Stencil
 from jaxfit._unrolling import unrolled
 
 LEAST_SHARE = 1e-12  # of a coordinate direction in what a control point weighs
+# Up to here the factors of the matrix take no more time than the iterations they save, and what is solved
+# exactly hardly depends on how sums are rounded: control points along the shorter side, and in all.
+FACTORED_SIDE, FACTORED_POINTS = 24, 1000
 
 
 class CoupledPreconditioner(eqx.Module):
@@ -24,11 +29,12 @@ class CoupledPreconditioner(eqx.Module):
 
     S_ij is the block of control point (i, j) with itself, divided by what M_0 has there: about
     $\Pi + \mu (I - \Pi)$ for the normal around (i, j). Where normals vary slowly over the support of a basis
-    function, $S^{1/2} (M_0 \otimes I) S^{1/2}$ is nearly the matrix.
+    function, $S^{1/2} (M_0 \otimes I) S^{1/2}$ is nearly the matrix. Without `roots` the factors are those of
+    the matrix itself.
     """
 
     factors: Factors
-    roots: Float[Array, "d d nu nv"]  # S^(-1/2)
+    roots: Float[Array, "d d nu nv"] | None  # S^(-1/2)
 
     def __call__(self, right: Float[Array, "nu nv d"]) -> Float[Array, "nu nv d"]:
         """Near the solution."""
@@ -39,6 +45,8 @@ class CoupledPreconditioner(eqx.Module):
         return self._rotated(substitute(self.factors, self._rotated(right)))
 
     def _rotated(self, x: Float[Array, "d nu nv"]) -> Float[Array, "d nu nv"]:
+        if self.roots is None:
+            return x
         products = self.roots * x[:, None]
         # Added one by one: a sum over the first axis takes a CPU ten times as long where nets are large.
         return reduce(add, lax.split(products, (1,) * x.shape[0], 0)).reshape(x.shape)
@@ -48,6 +56,8 @@ def coupled_preconditioner(
     matrix: CoupledStencil, uncoupled: Stencil, free: Bool[Array, "nu nv"]
 ) -> CoupledPreconditioner:
     """For the matrix on the free control points, those where `uncoupled` has a positive diagonal."""
+    if min(free.shape) <= FACTORED_SIDE and free.shape[0] * free.shape[1] <= FACTORED_POINTS:
+        return CoupledPreconditioner(factorise(matrix, free), None)
     diagonal = jnp.where(free, uncoupled.diagonal, 1.0)[:, :, None, None]
     blocks = matrix.blocks / diagonal
     unit = jnp.eye(blocks.shape[-1], dtype=diagonal.dtype)

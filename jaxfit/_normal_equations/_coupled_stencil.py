@@ -51,6 +51,10 @@ class CoupledStencil(eqx.Module):
         unit = jnp.eye(self.entries.shape[0], dtype=self.entries.dtype)[:, :, None, None, None, None]
         return CoupledStencil(self.entries + unit * other.entries[None, None])
 
+    def transposed(self) -> "CoupledStencil":
+        """The same matrix on the net with its directions exchanged."""
+        return CoupledStencil(self.entries.transpose(0, 1, 3, 2, 5, 4))
+
     def __call__(self, net: Float[Numbers, "nu nv d"]) -> Float[Array, "nu nv d"]:
         """The matrix times a net."""
         return jnp.moveaxis(self.product()(jnp.moveaxis(jnp.asarray(net), 2, 0)), 0, 2)
