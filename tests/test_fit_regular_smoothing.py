@@ -13,6 +13,8 @@ from jaxfit._approximation._regular_smoothing import FoldGuard
 from jaxfit._normal_equations import Roughness
 from jaxfit._splines._pieces import make_pieces
 
+FIRST = jnp.array(jf.RegularSmoothing().first)
+
 
 def sheet(x, y):
     return np.stack([x, y, 0.1 * np.sin(3 * x + 0.5) * np.cos(2.5 * y)], axis=-1)
@@ -173,7 +175,7 @@ def test_only_what_folds_were_kept_out_of_is_smoothed_once_more_and_only_in_time
     smoothing, order = jf.RegularSmoothing(), (4, 4)
     least, nothing = jnp.full((7, 6), smoothing.least), jnp.zeros((7, 6))
     for floor in (least, least.at[3, 3].set(8.0)):
-        guard = FoldGuard(floor, floor, nothing, nothing, jnp.zeros((4, 3)))
+        guard = FoldGuard(floor, floor, nothing, nothing, jnp.zeros((4, 3)), FIRST)
         yes, most = jnp.array(True), 40 if late else 39
         after = smoothing.after(guard, guard, yes, yes, order, jnp.array(25), jnp.array(most))
         if late and floor is not least:
@@ -187,7 +189,7 @@ def test_factors_fall_by_fall_squared_and_rise_to_first_with_the_first_fold():
     smoothing, order, yes, no = jf.RegularSmoothing(), (4, 4), jnp.array(True), jnp.array(False)
     factor, nothing, whole = jnp.full((7, 6), 10.0), jnp.zeros((7, 6)), jnp.zeros((4, 3))
     folded = whole.at[0, 0].set(1.0)
-    begun = FoldGuard(factor, jnp.full((7, 6), smoothing.least), nothing, nothing, whole)
+    begun = FoldGuard(factor, jnp.full((7, 6), smoothing.least), nothing, nothing, whole, FIRST)
 
     def after(guard, folds, good, step=3, better=yes):
         new = dataclasses.replace(guard, folds=folds)
@@ -217,7 +219,7 @@ def test_early_steps_that_fold_are_taken_again_with_all_factors_four_times_as_gr
     smoothing, order, yes, no = jf.RegularSmoothing(), (4, 4), jnp.array(True), jnp.array(False)
     nothing, whole = jnp.zeros((7, 6)), jnp.zeros((4, 3))
     folded = whole.at[0, 0].set(1.0)
-    begun = FoldGuard(nothing + smoothing.first, nothing + smoothing.least, nothing, nothing, whole)
+    begun = FoldGuard(nothing + smoothing.first, nothing + smoothing.least, nothing, nothing, whole, FIRST)
 
     def after(guard, step, good=no, folds=folded):
         new = dataclasses.replace(guard, folds=folds)
@@ -247,15 +249,29 @@ def test_many_points_to_a_control_point_do_not_crease_a_smooth_surface():
     assert fit.regularity.folds == fit.stats["points_out_of_reach"] == 0
 
 
+def test_many_points_far_from_the_base_are_reached():
+    def field(x, y):
+        return np.stack([x, y, 0.2 * np.sin(9 * x) * np.cos(7 * y)], axis=-1)
+
+    points = field(*np.random.default_rng(0).uniform(size=(2, 12_000)))
+    grid = field(*np.meshgrid(*2 * [np.linspace(0, 1, 200)], indexing="ij"))
+    base = jf.base_surface(jf.Boundary.from_grid(grid), net=(16, 16))
+    fit = jf.approximate(points, base, tol_average=3e-5, max_steps=30)
+    assert fit.history.average[0] > 0.04
+    assert fit.converged
+    assert fit.regularity.folds == 0
+
+
 def test_only_bases_near_the_points_and_without_folds_begin_with_less():
     nothing, whole = jnp.zeros((7, 6)), jnp.zeros((4, 3))
-    smooth, folded = (FoldGuard(*4 * (nothing,), folds) for folds in (whole, whole.at[0, 0].set(1.0)))
+    smooth, folded = (FoldGuard(*4 * (nothing,), folds, FIRST) for folds in (whole, whole.at[0, 0].set(1.0)))
     cases = ((smooth, 0, 0.04, 0.04), (smooth, 0, 0.049, 0.245**2), (smooth, 0, 0.0, 0.01))
-    cases += ((smooth, 0, 0.051, 1.0), (smooth, 1, 0.02, 1.0), (folded, 0, 0.02, 1.0))
-    for guard, step, error, share in cases:
-        at_base = guard.share_at_base(jnp.array(step), jnp.array(error), jnp.array(0.2))
-        np.testing.assert_allclose(at_base, share, rtol=1e-6)
-    no_free_control_point = smooth.share_at_base(jnp.array(0), jnp.array(0.02), jnp.array(0.0))
+    cases += ((smooth, 0, 0.051, 1.0), (smooth, 1, 0.02, 1.0), (folded, 0, 0.02, 1.0), (folded, 0, 0.06, 1.0))
+    for guard, step, error, expected in cases:
+        share, far = guard.at_base(jnp.array(step), jnp.array(error), jnp.array(0.2))
+        np.testing.assert_allclose(share, expected, rtol=1e-6)
+        assert bool(far) == (error > 0.05)
+    no_free_control_point, _ = smooth.at_base(jnp.array(0), jnp.array(0.02), jnp.array(0.0))
     np.testing.assert_array_equal(no_free_control_point, 1.0)
 
 

@@ -275,9 +275,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
         if guard is not None:
             assert here.summary is not None
             spacing = jnp.sum(longest * ~held) / (self.reach * jnp.maximum(jnp.sum(~held), 1))
-            share = guard.share_at_base(iterate.step, here.summary[0] * problem.diagonal, spacing)
-            guard, damping = self.smoothing.lowered(guard, share), share * damping
-            held = held | (guard.held > 0)
+            share, far = guard.at_base(iterate.step, here.summary[0] * problem.diagonal, spacing)
+            damping, held = share * damping, held | (guard.held > 0)
         always = problem.diagonal > 0
         pieces = surface.pieces
         feet = (here.u, here.v, weight)
@@ -289,6 +288,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             plate = plate_of(state.plate, surface)
             penalty: AbstractPenalty = WeightedPlate(plate, state.smoothing)
         else:
+            guard = self.smoothing.beginning(guard, share, far, term)
             penalty = self.smoothing.penalty(guard, surface, problem.diagonal, term)
 
         def correction_rhs(move: Array) -> Array:

@@ -29,6 +29,10 @@ EARLY_STEPS, STIFFER = 5, 4.0
 # A base whose average error is less than NEAR spacings of the net begins with less smoothing and damping, as
 # steps from there are seldom longer than control points may move; but with no less than LEAST_SHARE of them.
 NEAR, LEAST_SHARE = 0.25, 0.01
+# From a base farther away `first` grows with the number of points above this one, by the same factor: each
+# point pulls, but what it costs to bend the whole surface depends on the number neither of points nor of
+# control points. With too little smoothing first steps crease what has yet to move, and parts are caught.
+FEW_POINTS = 3000.0
 FAR = 4.0  # times the average error, where folds have been kept out: out of reach
 STUCK = 4.0  # times the least factor, around folds that a step has not removed
 RAISED_FLOOR = 1.2  # a factor at which there was a fold, times this, is not gone below
@@ -69,6 +73,9 @@ class RegularSmoothing(eqx.Module):
     distances cause. So after 25 iterations, if folds were kept out anywhere and the fit may take 40, all
     factors rise once more, to half of `first`, and what has been raised around folds is forgotten.
 
+    `first` is meant for up to 3,000 points, and grows in proportion to their number, because each of them
+    pulls at the surface, while a bend of its whole shape costs the same with any number and on any net.
+
     From a base surface without folds fewer steps are enough. Until a first fold has to be kept out, the
     factors fall by `fall` squared. If the distance of the points from the base is on average less than a
     quarter of the spacing of its free control points, the first factor is `first` times the square of the
@@ -84,7 +91,8 @@ class RegularSmoothing(eqx.Module):
         The factor where nothing folds (default 3): a bend of 0.58 radian between two control points counts
         as one point at the usual distance.
     first : float
-        The factor of the first step from a base surface far from the points (default 100).
+        The factor of the first step from a base surface far from the points, of which there are at most
+        3,000 (default 100).
     fall : float
         The factor of the next step over that of an accepted one, between 0 and 1 (default 0.7).
     raised : float
@@ -144,7 +152,7 @@ class RegularSmoothing(eqx.Module):
         factor, floor, zero = (xp.full(net.shape[:2], x, net.dtype) for x in (self.first, self.least, 0.0))
         folds = np.zeros((surface.axis_u.cells, surface.axis_v.cells), net.dtype)
         nothing = _no_roughness(*(_kind(x) for x in (net, surface.knots_u, surface.knots_v, factor)))
-        return FoldGuard(factor, floor, zero, zero, folds), nothing
+        return FoldGuard(factor, floor, zero, zero, folds, xp.asarray(self.first, net.dtype)), nothing
 
     def penalty(
         self, guard: "FoldGuard", surface: WorkingSurface, diagonal: Array, term: DataTerm
@@ -184,7 +192,8 @@ class RegularSmoothing(eqx.Module):
         floor = lax.select(fresh, raised_floor, floor)
         floor = lax.select(good, jnp.maximum(FLOOR_FALL * floor, self.least), floor)
         factor = lax.select(good, jnp.maximum(self.fall ** (1 + no_fold_yet) * factor, floor), factor)
-        usual = jnp.where(again, RENEWED, self.fall ** (step * ~in_time)) * self.first
+        usual = jnp.where(in_time, self.first, self.fall**step * new.first)
+        usual = jnp.where(again, RENEWED * self.first, usual)
         risen = again | (first_fold & late)
         factor = lax.select(risen, jnp.maximum(factor, usual), factor)
         floor = jnp.where(again, self.least, floor)
@@ -195,18 +204,19 @@ class RegularSmoothing(eqx.Module):
         # Also where no step is better, as none is while all are held.
         held = lax.select(fresh, holds, jnp.maximum(held - (good | ~better), 0.0))
         folds = lax.select(good, new.folds, jnp.asarray(old.folds))
-        return FoldGuard(factor, floor, holds, held, folds)
+        return FoldGuard(factor, floor, holds, held, folds, new.first)
 
-    def lowered(self, guard: "FoldGuard", share: Array) -> "FoldGuard":
-        """With this share of the factors, or `least`."""
-        factor = jnp.maximum(share * jnp.asarray(guard.factor), self.least)
-        return eqx.tree_at(lambda g: g.factor, guard, factor)
+    def beginning(self, guard: "FoldGuard", share: Array, far: Array, term: DataTerm) -> "FoldGuard":
+        """With this share of the factors, or `least`; from a base `far` away with more for many points."""
+        many = jnp.where(far, jnp.maximum(term.points / FEW_POINTS, 1.0), 1.0)
+        factor = jnp.maximum(share * many * jnp.asarray(guard.factor), self.least)
+        return dataclasses.replace(guard, factor=factor, first=many * guard.first)
 
     def renewed(self, guard: "FoldGuard", surface: WorkingSurface) -> "FoldGuard":
         """For a surface whose new knots have moved the control points in the net."""
         least = jnp.full_like(guard.factor, self.least)
         zero = jnp.zeros_like(least)
-        return FoldGuard(least, least, zero, zero, guard.folds).seeing(surface)
+        return FoldGuard(least, least, zero, zero, guard.folds, guard.first).seeing(surface)
 
     def has_faded(self, guard: "FoldGuard") -> Bool[Array, ""]:
         """Whether the factor of some control point has fallen to `least`."""
@@ -233,7 +243,8 @@ class RegularSmoothing(eqx.Module):
 
 class FoldGuard(eqx.Module):
     """Of each control point: the factor, what it does not fall below, for how many accepted steps the next
-    fold will hold it, and for how many it is held still; and the folds of the surface by cell.
+    fold will hold it, and for how many it is held still. The folds of the surface by cell, and the factor
+    that the fit began with.
     """
 
     factor: Float[Any, "nu nv"]
@@ -241,15 +252,17 @@ class FoldGuard(eqx.Module):
     holds: Float[Any, "nu nv"]
     held: Float[Any, "nu nv"]
     folds: Float[Any, "cells_u cells_v"]
+    first: Float[Any, ""]
 
-    def share_at_base(self, step: Any, error: Array, spacing: Array) -> Float[Array, ""]:
+    def at_base(self, step: Any, error: Array, spacing: Array) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """The share of the usual smoothing and damping that a step takes: for the first one from a base that
         is NEAR and has no folds the square of the average error over the average `spacing` of the net,
-        otherwise 1.
+        otherwise 1. And whether it is the first one from a base that is not near.
         """
-        near = (step == 0) & (error < NEAR * spacing) & ~jnp.any(jnp.asarray(self.folds) > 0)
+        close, smooth = error < NEAR * spacing, ~jnp.any(jnp.asarray(self.folds) > 0)
+        near = (step == 0) & close & smooth
         ratio = error / jnp.where(near, spacing, 1.0)
-        return jnp.where(near, jnp.maximum(ratio**2, LEAST_SHARE), 1.0)
+        return jnp.where(near, jnp.maximum(ratio**2, LEAST_SHARE), 1.0), (step == 0) & ~close
 
     def seeing(self, surface: WorkingSurface) -> "FoldGuard":
         """With the folds of this surface."""
