@@ -29,7 +29,7 @@ EARLY_STEPS, STIFFER = 5, 4.0
 # A base whose average error is less than NEAR spacings of the net begins with less smoothing and damping, as
 # steps from there are seldom longer than control points may move; but with no less than LEAST_SHARE of them.
 NEAR, LEAST_SHARE = 0.25, 0.01
-# From a base farther away `first` grows with the number of points above this one, by the same factor: each
+# From a base farther away `first` grows in proportion to the number of points, from this one on, for each
 # point pulls, but what it costs to bend the whole surface depends on the number neither of points nor of
 # control points. With too little smoothing first steps crease what has yet to move, and parts are caught.
 FEW_POINTS = 3000.0
