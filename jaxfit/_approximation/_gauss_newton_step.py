@@ -16,9 +16,9 @@ from jaxfit._normal_equations import (
 )
 from jaxfit._unrolling import constant, root
 
-# Conjugate gradients stop at this relative residual, which they reach where nets are small: there fits differ
-# little if sums are rounded otherwise. Or after so many steps: few where nets are large, for far from the end
-# an exact solution is no better. At small mu steps achieve what they predict, and the last digits take many.
+# Conjugate gradients stop at this relative residual, which takes a step or two on small nets, where they have
+# the factors of the matrix. Or after so many steps: few where nets are large, for far from the end an exact
+# solution is no better. At small mu steps achieve what they predict, and the last digits take many.
 RESIDUAL = 1e-9
 SMALL_NET = 1000  # control points
 FEW_STEPS, SOME_STEPS, MANY_STEPS = 16, 32, 100

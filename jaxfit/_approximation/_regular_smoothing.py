@@ -73,17 +73,16 @@ class RegularSmoothing(eqx.Module):
     distances cause. So after 25 iterations, if folds were kept out anywhere and the fit may take 40, all
     factors rise once more, to half of `first`, and what has been raised around folds is forgotten.
 
-    `first` is meant for up to 3,000 points, and grows in proportion to their number, because each of them
-    pulls at the surface, while a bend of its whole shape costs the same with any number and on any net.
-
     From a base surface without folds fewer steps are enough. Until a first fold has to be kept out, the
     factors fall by `fall` squared. If the distance of the points from the base is on average less than a
     quarter of the spacing of its free control points, the first factor is `first` times the square of the
-    ratio of the two, or `least`, and the first damping is the square of the ratio. When a first fold has to
-    be kept out, all factors rise to `first`; or, after 25 iterations and in fits that may not take 40, to
-    what falling by `fall` from the beginning would have left. But if one of the first five iterations would
-    fold while no factor has fallen below `first`, it is taken again with four times the factors everywhere:
-    clouds with many points to a control point need that.
+    ratio of the two, or `least`, and the first damping is the square of the ratio. Where it is more, the
+    first factor is `first` for up to 3,000 points and grows in proportion to their number: each of them pulls
+    at the surface, while a bend of its whole shape costs the same for any number of points and any net. When
+    a first fold has to be kept out, all factors rise to `first`; or, after 25 iterations and in fits that may
+    not take 40, to what falling by `fall` from the beginning would have left. But if one of the first five
+    iterations would fold while no factor has fallen below `first`, it is taken again with four times the
+    factors everywhere: clouds with many points to a control point need that.
 
     Parameters
     ----------

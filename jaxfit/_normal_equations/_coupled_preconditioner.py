@@ -55,7 +55,9 @@ class CoupledPreconditioner(eqx.Module):
 def coupled_preconditioner(
     matrix: CoupledStencil, uncoupled: Stencil, free: Bool[Array, "nu nv"]
 ) -> CoupledPreconditioner:
-    """For the matrix on the free control points, those where `uncoupled` has a positive diagonal."""
+    """For the matrix on the free control points, those where `uncoupled` has a positive diagonal. Small nets
+    do not use `uncoupled`.
+    """
     if min(free.shape) <= FACTORED_SIDE and free.shape[0] * free.shape[1] <= FACTORED_POINTS:
         return CoupledPreconditioner(factorise(matrix, free), None)
     diagonal = jnp.where(free, uncoupled.diagonal, 1.0)[:, :, None, None]
