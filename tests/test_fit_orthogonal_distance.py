@@ -5,13 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from helpers import data, diagonal, eps, wavy_cloud
+from helpers import clamped_uniform, data, diagonal, eps, wavy_cloud
 from normal_reference import thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._approximation._damping import (
     LEAST_DAMPING,
     DampingState,
+    actual_gain,
+    is_no_worse,
     longest_moves,
     next_damping,
     within_reach,
@@ -212,6 +214,37 @@ def test_damping_follows_the_fall_that_was_predicted(base):
         assert np.isclose(
             next_damping(state, jnp.asarray(1.5), jnp.asarray(fell), jnp.asarray(kept)), after, rtol=1e-6
         )
+
+
+def test_rounding_does_not_decide_on_a_step_that_moves_nothing(base):
+    surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v)
+    state = DampingState(surface, jnp.asarray(0.0), jnp.asarray(0.1), jnp.asarray(0))
+    for after in (1.0, np.nextafter(1.0, 0.0), np.nextafter(1.0, 2.0)):
+        gain = actual_gain(state, jnp.asarray(1.0), jnp.asarray(after))
+        assert bool(is_no_worse(state, gain, jnp.asarray(0.0)))
+        assert np.isclose(next_damping(state, jnp.asarray(1.0), gain, jnp.asarray(True)), 0.1)
+
+
+@pytest.mark.slow
+def test_small_fits_in_a_batch_differ_from_single_ones_by_rounding_alone():
+    def height(x, y):
+        return 0.1 * np.sin(3.0 * x + 0.5) * np.cos(2.5 * y)
+
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(size=(2, 32, 300))
+    bump = rng.uniform(-0.1, 0.1, (32, 1)) * np.sin(np.pi * x) * np.sin(np.pi * y)
+    clouds = jnp.asarray(np.stack([x, y, height(x, y) + bump], axis=-1))
+    knots = clamped_uniform(8, 4)
+    sites = np.asarray(jf.greville_abscissae(knots, 4))
+    x, y = np.meshgrid(sites, sites, indexing="ij")
+    sheet = jf.BSplineSurface(np.stack([x, y, height(x, y)], axis=-1), knots, knots)
+
+    def net(points):
+        return jf.approximate(points, sheet, tol_average=0.0, max_steps=20).surface.control_points
+
+    single = jax.jit(net)
+    apart = jax.jit(jax.vmap(net))(clouds) - jnp.stack([single(points) for points in clouds])
+    np.testing.assert_allclose(apart, 0.0, atol=1e-12)
 
 
 def test_moves_reach_no_farther_than_a_share_of_the_spacing():

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxfit._fit._working_surface import WorkingSurface
@@ -46,9 +46,15 @@ def first_damping(surface: WorkingSurface, dtype: Any) -> DampingState:
     return DampingState(surface, zero, one, np.zeros((), np.int32))
 
 
-def is_plausible(state: DampingState, gain: Array, longest_move: Array) -> Array:
-    """Whether no foot moved far, or else the reduction `gain` agrees with the prediction."""
-    return (longest_move < LONGEST_MOVE) | (gain > GOOD * state.predicted) | (state.damping >= 1)
+def actual_gain(state: DampingState, before: Array, after: Array) -> Array:
+    """By how much the objective has fallen; by nothing where all control points are held."""
+    return lax.select(state.predicted == 0, np.zeros((), before.dtype), before - after)
+
+
+def is_no_worse(state: DampingState, gain: Array, longest_move: Array) -> Array:
+    """Whether the objective has not risen, and no foot moved far or else the `gain` is what was predicted."""
+    plausible = (longest_move < LONGEST_MOVE) | (gain > GOOD * state.predicted) | (state.damping >= 1)
+    return (gain >= 0) & plausible
 
 
 def next_damping(

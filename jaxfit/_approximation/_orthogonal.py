@@ -16,9 +16,10 @@ from jaxfit._approximation._damping import (
     GUARDED_DAMPING,
     USUAL_DAMPING,
     DampingState,
+    actual_gain,
     farthest_move,
     first_damping,
-    is_plausible,
+    is_no_worse,
     longest_moves,
     next_damping,
 )
@@ -103,8 +104,8 @@ class OrthogonalDistance(AbstractIterativeMethod):
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1, or less where
     `RegularSmoothing` begins at a base near the points. After it mu follows the ratio of the actual to the
-    predicted reduction of F. A step is rejected if F, measured at converged feet, has not fallen; so F never
-    rises. It is also rejected if a foot has moved by several cells and the reduction is less than predicted.
+    predicted reduction of F. A step is rejected if F, measured at converged feet, has risen. It is
+    also rejected if a foot has moved by several cells and the reduction is less than predicted.
     A rejected step counts as an iteration, with the errors of the surface before it. F is measured at local
     feet. With `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and
     taken again with more smoothing there.
@@ -238,11 +239,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
         here, before = new.projection, old.projection
         nets = jnp.stack([damped.origin.control_points, new.surface.control_points])
         objective, after = state.sums.costs + jax.vmap(state.penalty.energy)(nets)
-        gain = objective - after
+        gain = actual_gain(damped, objective, after)
         longest_move = jnp.max(state.sums.longest_move)
         # With a traced lambda that is none no step is finite, and the loop ends.
         lost = jnp.isnan(state.smoothing)
-        good = better = lost | ((gain > 0) & is_plausible(damped, gain, longest_move))
+        good = better = lost | is_no_worse(damped, gain, longest_move)
         guard = state.guard
         if guard is not None:
             good = better & (jnp.sum(guard.folds) <= jnp.sum(old.state.guard.folds))
@@ -251,7 +252,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         # A step that folds is taken again with more smoothing, not with more damping.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
         following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
-        following = jnp.where(better & ~good, damped.damping, following)
+        following = lax.select(better & ~good, damped.damping, following)
         following = jnp.where((new.step == 1) & good, self.damping, following)
         assert before.summary is not None
         assert here.summary is not None
