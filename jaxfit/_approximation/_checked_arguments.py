@@ -70,12 +70,9 @@ def check_options(
             f"method must be one for clouds such as OrthogonalDistance(), but {name}() is one for grids; "
             "call interpolate."
         )
-    if method is not None:
-        check_kind("method", method, AbstractIterativeMethod, METHODS)
-    if errors is not None:
-        check_kind("errors", errors, AbstractErrors, "GlobalFeet(), LocalFeet() or AtParameters()")
-    if adjoint is not None:
-        check_kind("adjoint", adjoint, AbstractAdjoint, "ImplicitAdjoint() or UnrolledAdjoint()")
+    check_kind("method", method, AbstractIterativeMethod | None, METHODS)
+    check_kind("errors", errors, AbstractErrors | None, "GlobalFeet(), LocalFeet() or AtParameters()")
+    check_kind("adjoint", adjoint, AbstractAdjoint | None, "ImplicitAdjoint() or UnrolledAdjoint()")
     check_steps("max_steps", max_steps)
     for name, tolerance in (("tol_average", tol_average), ("tol_maximum", tol_maximum)):
         if tolerance is not None and is_concrete(tolerance):

@@ -140,8 +140,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
-            if getattr(self, name) is not None:
-                check_kind(name, getattr(self, name), kind, f"{kind.__name__}()")
+            check_kind(name, getattr(self, name), kind | None, f"{kind.__name__}()")
         check_border(self.border)
         check_method(self)
         check_switches(self, ("single_step", "local"))

@@ -78,8 +78,7 @@ def room_for(insertion: KnotInsertion | None, surface: WorkingSurface, max_steps
 
 def check_insertion(insertion: Any) -> None:
     """Raise unless `insertion` is a KnotInsertion, or None for none."""
-    if insertion is not None:
-        check_kind("insertion", insertion, KnotInsertion, "KnotInsertion()")
+    check_kind("insertion", insertion, KnotInsertion | None, "KnotInsertion()")
 
 
 def insert_in_worst_spans(surface: WorkingSurface, u: Array, v: Array, error: Array) -> WorkingSurface:

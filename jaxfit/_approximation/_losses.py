@@ -176,8 +176,7 @@ class GemanMcClure(AbstractLoss):
 
 def check_loss(loss: Any) -> None:
     """Raise unless `loss` is a loss, or None for least squares."""
-    if loss is not None:
-        check_kind("loss", loss, AbstractLoss, "Huber(), Tukey() or GemanMcClure()")
+    check_kind("loss", loss, AbstractLoss | None, "Huber(), Tukey() or GemanMcClure()")
 
 
 def loss_length(loss: AbstractLoss | None, problem: Problem, axes: tuple[Axis, Axis], error: Any) -> Any:

@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,12 +16,11 @@ from jaxfit._approximation._orthogonal import OrthogonalDistance
 from jaxfit._approximation._smoothing_term import plate_of
 from jaxfit._approximation._standard import StandardApproximation, StandardState
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import NormalOperator, Stencil, free_points, normal_solver
-from jaxfit._precision import working_dtype
 
 
 class NormalSums(eqx.Module):
@@ -111,12 +109,6 @@ def by_sums(method: AbstractIterativeMethod, kinds: dict[type, type], where: str
     fields = {x.name: getattr(method, x.name) for x in dataclasses.fields(method)}
     _check_fields(fields, where)
     return kind(**fields)
-
-
-def static_and_numbers(method: AbstractIterativeMethod) -> tuple[Any, Any]:
-    """The static fields of a method, and its numbers as arrays: what compiled programs take."""
-    numbers, rest = dynamic_fields(method)
-    return rest, jax.tree.map(lambda x: np.asarray(x, working_dtype()), numbers)
 
 
 def _check_fields(fields: dict[str, Any], where: str) -> None:

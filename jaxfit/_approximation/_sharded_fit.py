@@ -32,14 +32,14 @@ from jaxfit._approximation._cloud_fit import (
     working_surface,
 )
 from jaxfit._approximation._errors import GlobalFeet
-from jaxfit._approximation._methods_by_sums import ON_DEVICES, by_sums, static_and_numbers
+from jaxfit._approximation._methods_by_sums import ON_DEVICES, by_sums
 from jaxfit._approximation._shards import divided_over, local_rows, with_local_rows
 from jaxfit._checks import as_points, check_kind, is_concrete
 from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._fit._history import ErrorHistory, public_history
 from jaxfit._fit._loop import begin, iterate
-from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method import AbstractIterativeMethod, static_and_numbers
 from jaxfit._fit._problem import MeshAxis, Tolerances, make_problem
 from jaxfit._fit._reasons import result_of
 from jaxfit._fit._result import Fit, converged_or_raise

@@ -18,8 +18,8 @@ def basis_matrix(
 
 
 def along_both(
-    first: Float[Any, "a n"], net: Float[Any, "n m d"], second: Float[Any, "b m"]
-) -> Float[Any, "a b d"]:
+    first: Float[Any, "a n"], net: Float[Any, "n m *d"], second: Float[Any, "b m"]
+) -> Float[Any, "a b *d"]:
     """One matrix along each direction of a net."""
     return np.swapaxes(np.tensordot(second, np.tensordot(first, net, 1), (1, 1)), 0, 1)
 
@@ -27,18 +27,20 @@ def along_both(
 class GridEvaluator:
     """Points and normals of the surfaces of one spline space, on one grid of parameters."""
 
-    def __init__(self, knots: Knots, order: tuple[int, int], u: np.ndarray, v: np.ndarray):
-        self._u = [basis_matrix(knots[0], order[0], u, k) for k in (0, 1)]
-        self._v = [basis_matrix(knots[1], order[1], v, k) for k in (0, 1)]
+    def __init__(
+        self, knots: Knots, order: tuple[int, int], u: np.ndarray, v: np.ndarray, dtype: Any = float
+    ):
+        self._u = [basis_matrix(knots[0], order[0], u, k).astype(dtype) for k in (0, 1)]
+        self._v = [basis_matrix(knots[1], order[1], v, k).astype(dtype) for k in (0, 1)]
 
-    def points(self, net: Float[Any, "nu nv d"]) -> Float[Any, "a b d"]:
-        """R(u_a, v_b)."""
-        return along_both(self._u[0], net, self._v[0])
+    def points(self, net: Float[Any, "nu nv *d"], du: int = 0, dv: int = 0) -> Float[Any, "a b *d"]:
+        """R(u_a, v_b), or a first derivative."""
+        return along_both(self._u[du], net.astype(self._u[0].dtype), self._v[dv])
 
     def normals(self, net: Float[Any, "nu nv 3"]) -> Float[Any, "a b 3"]:
         """Unit normals, zero where the surface has none."""
-        along_u = along_both(self._u[1], net, self._v[0])
-        cross = np.cross(along_u, along_both(self._u[0], net, self._v[1]))
+        along_u = self.points(net, 1, 0)
+        cross = np.cross(along_u, self.points(net, 0, 1))
         length = np.linalg.norm(cross, axis=2, keepdims=True)
         return cross / np.where(length > 0, length, 1.0)
 

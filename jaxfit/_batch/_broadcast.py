@@ -47,8 +47,7 @@ def requests_of(clouds: Any, base: Any, method: Any, weights: Any) -> list[Reque
     requests = [Request(getattr(row[0], "cloud", row[0]), *row[1:]) for row in zip(*columns, strict=True)]
     for i, request in enumerate(requests):
         check_kind(f"base[{i}]", request.base, BSplineSurface, "base_surface(boundary)")
-        if request.method is not None:
-            check_kind(f"method[{i}]", request.method, AbstractIterativeMethod, "GeometricApproximation()")
+        check_kind(f"method[{i}]", request.method, AbstractIterativeMethod | None, "GeometricApproximation()")
     return requests
 
 

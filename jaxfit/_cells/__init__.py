@@ -14,7 +14,6 @@ from jaxfit._cells._polynomials import Jet as Jet
 from jaxfit._cells._polynomials import evaluate_first_order as evaluate_first_order
 from jaxfit._cells._polynomials import evaluate_jet as evaluate_jet
 from jaxfit._cells._polynomials import evaluate_values as evaluate_values
-from jaxfit._cells._polynomials import horner as horner
 from jaxfit._cells._polynomials import powers as powers
 from jaxfit._cells._rows import Rows as Rows
 from jaxfit._cells._rows import make_rows as make_rows

@@ -30,6 +30,7 @@ from jaxfit._progress_line import shows_progress
 from jaxfit._splines import BSplineCurve, BSplineSurface
 from jaxfit._splines._evaluate import evaluate_surface
 from jaxfit._splines._pieces import as_surface_arrays, make_axis
+from jaxfit._unrolling import root_with_slope
 
 
 class PointStatus(enum.IntEnum):
@@ -286,9 +287,7 @@ def _at_feet(
     net, knots_u, knots_v = arrays
     u, v = as_feet(feet, arrays, points, tolerance)
     (point,) = evaluate_surface(net, knots_u, knots_v, u, v, ((0, 0),), False)
-    square = jnp.sum((points - point) ** 2, axis=-1)
-    apart = square > 0
-    distance = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
+    distance = root_with_slope(jnp.sum((points - point) ** 2, axis=-1))
     order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
     ends_u = knots_u[order_u - 1 : knots_u.shape[0] - order_u + 1]
     ends_v = knots_v[order_v - 1 : knots_v.shape[0] - order_v + 1]

@@ -80,7 +80,6 @@ def as_feet(
     surface: Arrays,
     points: Float[Array, "points d"],
     tolerance: Array,
-    within: ParameterBounds | None = None,
 ) -> tuple[Array, Array]:
     """The parameters `feet` (u, v) of `points`, known to be feet, as functions of surface and points.
 
@@ -91,7 +90,7 @@ def as_feet(
 
 @as_feet.defjvp
 def _as_feet_jvp(primals: Any, tangents: Any) -> Any:
-    _, (net, knots_u, knots_v), points, tolerance, within = primals
+    _, (net, knots_u, knots_v), points, tolerance = primals
     u, v = as_feet(*primals)  # for derivatives of the derivative
 
     def slopes(surface: Arrays, points: Array) -> tuple[Array, Array]:
@@ -105,9 +104,8 @@ def _as_feet_jvp(primals: Any, tangents: Any) -> Any:
     e = points - value
     E, F, G = (jnp.sum(x * y, -1) for x, y in ((ru, ru), (ru, rv), (rv, rv)))
     a, b, c = (x - jnp.sum(e * y, -1) for x, y in ((E, ruu), (F, ruv), (G, rvv)))
-    if within is None:
-        order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
-        within = _ends(knots_u, order_u) + _ends(knots_v, order_v)
+    order_u, order_v = knots_u.shape[0] - net.shape[0], knots_v.shape[0] - net.shape[1]
+    within = _ends(knots_u, order_u) + _ends(knots_v, order_v)
     change = foot_change((u, v), (gu, gv), (E, F, G), (a, b, c), (dgu, dgv), within, tolerance)
     return (u, v), change
 

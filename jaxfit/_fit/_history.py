@@ -1,6 +1,5 @@
 """`ErrorHistory`, the record of the loop, and `History`, the same for users."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -137,8 +136,3 @@ def public_history(history: ErrorHistory, last_step: Any, fairing: Any = None) -
     refined = xp.any(net > xp.concatenate([net[:1], net[:-1]]), axis=1)
     parts = [*errors, counts[0], net, xp.asarray(faired), refined]
     return History(*(jax.device_put(parts) if concrete else (jnp.asarray(x) for x in parts)))
-
-
-def without_counts(history: History) -> History:
-    """The history without counts, as fits of grids report it."""
-    return dataclasses.replace(history, active=None, net=None, faired=None, refined=None)

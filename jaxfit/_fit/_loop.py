@@ -20,7 +20,7 @@ from jaxtyping import Bool, Int
 from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, dynamic_fields
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate, static_and_numbers
 from jaxfit._fit._problem import Problem, summary_of
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._reasons import RESULTS, code_of
@@ -66,7 +66,7 @@ def run(
     method: AbstractIterativeMethod, problem: Problem, loop: LoopState, progress: Progress | None
 ) -> tuple[LoopState, dict[str, Any]]:
     """The whole loop at once, or with `progress` in chunks of about REPORT_SECONDS."""
-    rest, numbers = _split(method, problem)
+    rest, numbers = static_and_numbers(method)
     inputs = (numbers, problem, loop)
     if not is_concrete(inputs):
         numbers, problem, loop = jax.tree.map(jnp.asarray, inputs)
@@ -98,14 +98,7 @@ def compile_ahead(
         Exception
     ):  # what a method of the user's can't do from there, it will say in `run`
         loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
-        _advance.ahead(*_split(method, problem), problem, problem.tolerances.max_steps, loop)
-
-
-def _split(method: AbstractIterativeMethod, problem: Problem) -> tuple[Any, Any]:
-    """The static fields of a method, and its numbers."""
-    numbers, rest = dynamic_fields(method)
-    numbers = jax.tree.map(lambda x: np.asarray(x, problem.target.dtype) if is_concrete(x) else x, numbers)
-    return rest, numbers
+        _advance.ahead(*static_and_numbers(method), problem, problem.tolerances.max_steps, loop)
 
 
 @partial(compiled, kept=True, static_argnums=0)

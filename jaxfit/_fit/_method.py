@@ -9,13 +9,14 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxfit._checks import Scalar, check_kind, check_number
+from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._stationarity import Stationarity
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._precision import working_dtype
 
 
 class Iterate(eqx.Module):
@@ -175,6 +176,12 @@ def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
 def static_fields(method: AbstractIterativeMethod) -> Any:
     """The fields that are no traced numbers: a program's, hashable."""
     return dynamic_fields(method)[1]
+
+
+def static_and_numbers(method: AbstractIterativeMethod) -> tuple[Any, Any]:
+    """The static fields of a method, and its numbers as arrays where they are known: what programs take."""
+    numbers, rest = dynamic_fields(method)
+    return rest, jax.tree.map(lambda x: np.asarray(x, working_dtype()) if is_concrete(x) else x, numbers)
 
 
 def check_method(method: Any) -> None:

@@ -20,7 +20,6 @@ from jaxfit._fit._history import (
     ErrorHistory,
     History,
     public_history,
-    without_counts,
 )
 from jaxfit._fit._loop import Progress
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
@@ -173,7 +172,8 @@ def _cut(history: History, made: int) -> History:
 
 def errors_only(history: ErrorHistory, steps: Any) -> History:
     """The history as fits of grids report it."""
-    return without_counts(public_history(history, steps))
+    whole = public_history(history, steps)
+    return dataclasses.replace(whole, active=None, net=None, faired=None, refined=None)
 
 
 def refuse_normals(method: str, normals: Any) -> None:

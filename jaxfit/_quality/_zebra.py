@@ -97,11 +97,7 @@ def zebra_grid(
 ) -> Float[Array, "a b"]:
     """`zebra` at all combinations of `us` (a,) and `vs` (b,), much cheaper than at a b separate points."""
     axis, eye = _checked(direction, stripes, view)
-    if surface.dimension != 3:
-        raise ValueError(
-            f"zebra stripes need a surface in three dimensions, but this one has {surface.dimension}; "
-            "use affine() to take it there."
-        )
+    surface._must_be_spatial("zebra stripes")
     normal = unit_normal(surface.grid(us, vs, 1, 0), surface.grid(us, vs, 0, 1))
     return _wave(normal, axis, eye, int(stripes))
 

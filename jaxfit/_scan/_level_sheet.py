@@ -5,23 +5,16 @@ that neighbours in space agree on. Where the whole cloud is flat, it is a sheet 
 nevertheless.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxfit._scan._hole_filling import filled_holes
-from jaxfit._scan._manifold import Faces, manifold
+from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
 FLATTEST = 0.2  # the largest spread across the plane, over the smaller one within it
 POINTS_A_NODE = 4
-
-
-class LevelNodes(NamedTuple):
-    """Nodes in the frame of the principal axes, the height last, and the node of every point."""
-
-    nodes: Float[np.ndarray, "nodes 3"]
-    number: Int[np.ndarray, " points"]
 
 
 def principal_frame(points: Float[Any, "points 3"]) -> tuple[Float[Any, "3 3"], Float[Any, "3"]]:
@@ -40,7 +33,7 @@ def is_level(points: Float[Any, "points 3"]) -> bool:
     return bool(spread[2] < FLATTEST * spread[1])
 
 
-def level_nodes(flat: Float[Any, "points 3"], most: int) -> LevelNodes:
+def level_nodes(flat: Float[Any, "points 3"], most: int) -> Float[np.ndarray, "nodes 3"]:
     """At most about `most` squares with points, the medians of whose coordinates are the nodes."""
     wanted = max(min(most, len(flat) // POINTS_A_NODE), 1)
     size = np.sqrt(np.prod(np.ptp(flat[:, :2], axis=0)) / wanted)
@@ -51,14 +44,12 @@ def level_nodes(flat: Float[Any, "points 3"], most: int) -> LevelNodes:
     for axis in range(3):
         order = np.lexsort((flat[:, axis], number))
         nodes[:, axis] = flat[order[first + count // 2], axis]
-    return LevelNodes(nodes, number)
+    return nodes
 
 
 def level_mesh(nodes: Float[Any, "nodes 3"], length: float) -> Faces:
     """Delaunay's triangles in the plane, without edges longer than `length` there."""
     from scipy.spatial import Delaunay
-
-    from jaxfit._scan._manifold import longest_edges
 
     plane = nodes * [1, 1, 0]
     faces = Delaunay(nodes[:, :2]).simplices

@@ -165,7 +165,7 @@ def _level(cloud: np.ndarray, length: float | None) -> tuple[SheetMesh, float]:
 
     frame = principal_frame(cloud)[0]
     turned = cloud @ frame.T
-    nodes = level_nodes(turned, LEVEL_NODES).nodes
+    nodes = level_nodes(turned, LEVEL_NODES)
     flat = nodes * [1, 1, 0]
     reach = _hole_length(flat) if length is None else length
     faces = largest_piece(flat, level_mesh(nodes, reach))

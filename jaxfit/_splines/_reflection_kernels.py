@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxfit._compile import compiled
+from jaxfit._unrolling import root_with_slope
 
 # Of symmetric data the leading eigenvalue stands above the others by the whole sum of squared differences;
 # a direction that does so by less than this share of it is no direction.
@@ -125,6 +126,4 @@ def reversal_mean(
 @compiled
 def largest_distance(a: Float[Array, "*shape d"], b: Float[Array, "*shape d"]) -> Float[Array, ""]:
     """The largest distance of corresponding points, with gradient zero where all coincide."""
-    squared = jnp.max(jnp.sum((a - b) ** 2, axis=-1))
-    apart = squared > 0
-    return jnp.where(apart, jnp.sqrt(jnp.where(apart, squared, 1.0)), 0.0)
+    return root_with_slope(jnp.max(jnp.sum((a - b) ** 2, axis=-1)))

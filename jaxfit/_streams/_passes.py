@@ -12,11 +12,10 @@ import numpy as np
 from jax import Array
 
 from jaxfit._approximation._errors import AbstractErrors
-from jaxfit._approximation._methods_by_sums import static_and_numbers
 from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._cores import cores
-from jaxfit._fit._method import Iterate
+from jaxfit._fit._method import Iterate, static_and_numbers
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit

@@ -18,12 +18,12 @@ from jaxfit._approximation._cloud_fit import (
     working_surface,
 )
 from jaxfit._approximation._errors import GlobalFeet
-from jaxfit._approximation._methods_by_sums import IN_BLOCKS, by_sums, static_and_numbers
+from jaxfit._approximation._methods_by_sums import IN_BLOCKS, by_sums
 from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, record_and_move
-from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method import AbstractIterativeMethod, static_and_numbers
 from jaxfit._fit._problem import Problem, make_problem, summary_of
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, converged_or_raise
@@ -75,10 +75,20 @@ def _fitted(
     average, maximum, unconverged = passes.finish(loop.current, surface, errors, lost)
     loss = unit.loss(np.asarray(surface.control_points))
     code = final_code(loop.code, (average, maximum), loss, passes.tolerances)
-    loop = eqx.tree_at(lambda x: x.code, loop, code)
     known = stats_of(method, passes.tolerances, loop.current.step, unit, unconverged)
-    stats = known | {"passes": passes.made + 1} | stats  # with the first, which finds the unit
-    fit = _fit(loop, passes.feet, surface, average, maximum, stats, getattr(method, "fairing", None))
+    mean, largest = jax.device_put([np.asarray(x, working_dtype()) for x in (average, maximum)])
+    u, v, relative = passes.feet.rows
+    fit = Fit(
+        surface=surface,
+        u=u,
+        v=v,
+        errors=relative,
+        average_error=mean,
+        maximum_error=largest,
+        history=public_history(loop.history, loop.current.step, getattr(method, "fairing", None)),
+        result=result_of(code),
+        stats=known | {"passes": passes.made + 1} | stats,  # with the first, which finds the unit
+    )
     return converged_or_raise(fit) if request["throw"] else fit
 
 
@@ -193,28 +203,3 @@ def _postprocess(rest: Any, numbers: Any, problem: Problem, loop: LoopState) -> 
     """The method's statistics; the methods that go by sums return the last iterate as it is."""
     early = (loop.code == code_of(RESULTS.stalled)) | (loop.code == code_of(RESULTS.diverged))
     return eqx.combine(numbers, rest).postprocess(problem, loop.current, early)[1]
-
-
-def _fit(
-    loop: LoopState,
-    stored: StoredFeet,
-    surface: BSplineSurface,
-    average: float,
-    maximum: float,
-    stats: dict[str, Any],
-    fairing: Any,
-) -> Fit:
-    dtype = working_dtype()
-    mean, largest = jax.device_put([np.asarray(x, dtype) for x in (average, maximum)])
-    u, v, errors = stored.rows
-    return Fit(
-        surface=surface,
-        u=u,
-        v=v,
-        errors=errors,
-        average_error=mean,
-        maximum_error=largest,
-        history=public_history(loop.history, loop.current.step, fairing),
-        result=result_of(loop.code),
-        stats=stats,
-    )

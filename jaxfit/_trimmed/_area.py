@@ -12,6 +12,7 @@ from jaxfit._checks import is_concrete
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed._checked_loops import Loop, edges_of
 from jaxfit._trimmed._quadrature import Nodes, along_edges, quadrature
+from jaxfit._unrolling import root_with_slope
 
 Loops = tuple[Float[Array, "_ 2"], ...]
 
@@ -58,9 +59,7 @@ def _element(surface: BSplineSurface, u: np.ndarray, v: np.ndarray) -> Float[Arr
     dtype = surface.control_points.dtype
     at = jnp.asarray(u, dtype), jnp.asarray(v, dtype)
     normal = jnp.cross(surface.derivative(*at, 1, 0), surface.derivative(*at, 0, 1))
-    squared = jnp.sum(normal**2, axis=-1)
-    length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    return jnp.where(squared > 0, length, 0.0)
+    return root_with_slope(jnp.sum(normal**2, axis=-1))
 
 
 def on_host(loops: Loops) -> list[Loop]:

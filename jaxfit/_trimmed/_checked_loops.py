@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._trimmed._inside import Edges, inside_on_host
+
 Loop = Float[np.ndarray, "_ 2"]
-Edges = Float[np.ndarray, "edges 2 2"]  # start and end of each
 
 _ROUNDING = 1e-9  # of the width of the domain, by which vertices may lie outside; of 1, of a sine
 
@@ -39,15 +40,6 @@ def signed_area(loop: Loop) -> float:
     """The area of a closed polyline, positive if it runs counter-clockwise."""
     x, y = (loop - loop.mean(axis=0)).T
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-
-
-def is_inside(loop: Loop, point: Float[np.ndarray, "2"]) -> bool:
-    """Whether a point is inside a closed polyline, by the number of edges to its right."""
-    start, end = np.moveaxis(edges_of([loop]), 1, 0)
-    crossed = (start[:, 1] > point[1]) != (end[:, 1] > point[1])
-    start, end = start[crossed], end[crossed]
-    share = (point[1] - start[:, 1]) / (end[:, 1] - start[:, 1])
-    return bool(np.sum(start[:, 0] + share * (end[:, 0] - start[:, 0]) > point[0]) % 2)
 
 
 def _name(i: int) -> str:
@@ -162,13 +154,13 @@ def _check_holes(loops: Sequence[Loop]) -> None:
     """Raise unless each hole is inside the outer loop and outside the other holes; loops do not touch."""
     outer, *holes = loops
     for i, hole in enumerate(holes, start=1):
-        if not is_inside(outer, hole[0]):
+        if not inside_on_host(edges_of([outer]), hole[:1])[0]:
             raise ValueError(
                 f"loops must begin with the outer one, but {_name(i)} is not inside {_name(0)}; put the "
                 "outer loop first, and make a surface of its own for each further piece."
             )
         for j, other in enumerate(holes, start=1):
-            if i != j and is_inside(other, hole[0]):
+            if i != j and inside_on_host(edges_of([other]), hole[:1])[0]:
                 raise ValueError(
                     f"loops must hold holes side by side, but {_name(i)} is inside {_name(j)}; leave it out "
                     "or make a surface of its own of that island."

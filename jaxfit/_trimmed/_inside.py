@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfit._trimmed._checked_loops import Edges
-
+Edges = Float[np.ndarray, "edges 2 2"]  # start and end of each
 _BLOCK = 4096  # points, so that the comparisons with all edges stay in the cache
 
 

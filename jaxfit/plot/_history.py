@@ -1,13 +1,12 @@
 """`history`: the errors of every iteration of a fit."""
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxfit.plot._part import check_fit
-from jaxfit.plot._picture import blank_figure, save
+from jaxfit.plot._picture import blank_figure, finished
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,8 +58,4 @@ def history(fit: Any, path: str | os.PathLike | None = None, title: str = "", dp
     axes.set_ylabel("error, % of the diagonal")
     axes.grid(color="0.9")
     axes.legend()
-    if title:
-        figure.suptitle(title, fontsize=14, fontweight="bold")
-    if path is not None:
-        save(figure, Path(path), dpi)
-    return figure
+    return finished(figure, path, title, dpi)

@@ -1,14 +1,13 @@
 """`loops`: the region of a trimmed fit in the domain of its surface."""
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxfit._trimmed._area import knot_lines
 from jaxfit.plot._part import check_fit
-from jaxfit.plot._picture import blank_figure, draw_loops, save
+from jaxfit.plot._picture import blank_figure, draw_loops, finished
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,8 +75,4 @@ def loops(fit: Any, path: str | os.PathLike | None = None, title: str = "", dpi:
     handles: Any = axes.legend(loc="upper right", fontsize=8, framealpha=0.9).legend_handles
     for handle in handles:
         handle.set_sizes([32.0])
-    if title:
-        figure.suptitle(title, fontsize=14, fontweight="bold")
-    if path is not None:
-        save(figure, Path(path), dpi)
-    return figure
+    return finished(figure, path, title, dpi)

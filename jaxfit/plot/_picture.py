@@ -89,11 +89,7 @@ def surface_and_errors(
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1))
     view = _draw_surface(left, fit)
     _draw_errors(right, fit, 100 * errors, view)
-    if title:
-        figure.suptitle(title, fontsize=14, fontweight="bold")
-    if path is not None:
-        save(figure, Path(path), dpi)
-    return figure
+    return finished(figure, path, title, dpi)
 
 
 def surface_beside_errors(fit: Any, points: ArrayLike | None = None) -> tuple["Figure", "Figure"]:
@@ -248,9 +244,14 @@ def blank_figure(width: int, rows: int = 1) -> "Figure":
     return figure
 
 
-def save(figure: "Figure", path: Path, dpi: int) -> None:
-    """Write a picture, whole or not at all."""
+def finished(figure: "Figure", path: str | os.PathLike | None, title: str, dpi: int) -> "Figure":
+    """The figure with its title, written if there is a path: whole or not at all."""
+    if title:
+        figure.suptitle(title, fontsize=14, fontweight="bold")
+    if path is None:
+        return figure
     check_output(path, PICTURES)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=path.suffix.lstrip(".").lower(), dpi=dpi)
+    figure.savefig(buffer, format=Path(path).suffix.lstrip(".").lower(), dpi=dpi)
     write_atomically(path, buffer.getvalue())
+    return figure

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit._base._host_splines import basis_matrix
+from jaxfit._base._host_splines import GridEvaluator
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit.plot._part import ranges, shown, whole
@@ -54,9 +55,9 @@ def render(
     (us, step_u), (vs, step_v) = _refine(us, seen, pixel), _refine(vs, seen.swapaxes(0, 1), pixel)
     # The view is affine: applied to the control points, it applies to the surface.
     net = (view(_net(surface)) - framed.min(axis=0)) / pixel
-    points = _Samples(surface, us, vs)
+    points = _evaluator(surface, us, vs)
     kept = shown(part, us, vs)
-    x, y, z = (points(net[..., c])[kept] for c in range(3))
+    x, y, z = (points.points(net[..., c])[kept] for c in range(3))
     keys = _nearest(x, y, z, np.flatnonzero(kept), int(np.ceil(max(step_u, step_v))))
     filled = keys >= 0
     index = keys[filled] & ((1 << _INDEX_BITS) - 1)
@@ -80,31 +81,20 @@ def render(
     return _pad(_halve(image), aspect), view
 
 
-class _Samples:
-    """Splines on the knots of a surface, and their derivatives, on one grid of parameters.
-
-    By dense matrices in single precision, which is faster than looking up the span of each sample.
-    """
-
-    def __init__(self, surface: BSplineSurface, us: np.ndarray, vs: np.ndarray, dtype: type = np.float32):
-        self._dtype = dtype
-        self._u, self._v = (
-            [basis_matrix(np.asarray(knots, float), order, at, k).astype(dtype) for k in (0, 1)]
-            for knots, order, at in zip(
-                (surface.knots_u, surface.knots_v), surface.order, (us, vs), strict=True
-            )
-        )
-
-    def __call__(self, net: Float[np.ndarray, "nu nv"], du: int = 0, dv: int = 0) -> Float[np.ndarray, "a b"]:
-        return self._u[du] @ net.astype(self._dtype) @ self._v[dv].T
+def _evaluator(
+    surface: BSplineSurface, us: np.ndarray, vs: np.ndarray, dtype: Any = np.float32
+) -> GridEvaluator:
+    """Of the surface's knots; in single precision, which a picture needs no more than."""
+    knots = np.asarray(surface.knots_u, float), np.asarray(surface.knots_v, float)
+    return GridEvaluator(knots, surface.order, us, vs, dtype)
 
 
 def coarse_points(part: BSplineSurface | TrimmedSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evenly spaced parameters along u and along v, and the points there: enough to choose a view."""
     surface = whole(part)
     us, vs = (np.linspace(low, high, _COARSE) for low, high in ranges(part))
-    points, net = _Samples(surface, us, vs, float), _net(surface)
-    return us, vs, np.stack([points(net[..., c]) for c in range(3)], axis=-1)
+    points = _evaluator(surface, us, vs, float).points(_net(surface))
+    return us, vs, points
 
 
 def _net(surface: BSplineSurface) -> Float[np.ndarray, "nu nv 3"]:
@@ -123,12 +113,14 @@ def _refine(at: np.ndarray, seen: np.ndarray, pixel: float) -> tuple[np.ndarray,
     return np.interp(np.linspace(0, along[-1], count), along, at), along[-1] / (count - 1)
 
 
-def _heights(surface: BSplineSurface, view: View, points: _Samples, index: np.ndarray) -> np.ndarray | None:
+def _heights(
+    surface: BSplineSurface, view: View, points: GridEvaluator, index: np.ndarray
+) -> np.ndarray | None:
     """Heights from 0 to 1 of a relief at the samples `index`; None for any other surface."""
     if not view.relief:
         return None
     net = _net(surface)[..., "xyz".index(view.relief)]
-    height = points(net - net.min())
+    height = points.points(net - net.min())
     height = (height - height.min()) / max(np.ptp(height), np.finfo(np.float32).tiny)
     return height.ravel()[index]
 
@@ -142,9 +134,9 @@ def _ground(heights: np.ndarray | None, count: int) -> Float[np.ndarray, "count 
     return np.stack(channels, axis=-1).astype(np.float32)
 
 
-def _shade(net: Float[np.ndarray, "nu nv 3"], points: _Samples) -> Float[np.ndarray, "a b"]:
+def _shade(net: Float[np.ndarray, "nu nv 3"], points: GridEvaluator) -> Float[np.ndarray, "a b"]:
     """Brightness by the angle to the light; both sides are lit."""
-    along_u, along_v = ([points(net[..., c], *which) for c in range(3)] for which in ((1, 0), (0, 1)))
+    along_u, along_v = ([points.points(net[..., c], *which) for c in range(3)] for which in ((1, 0), (0, 1)))
     normal = [along_u[b] * along_v[c] - along_u[c] * along_v[b] for b, c in ((1, 2), (2, 0), (0, 1))]
     length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
     light = _LIGHT / np.linalg.norm(_LIGHT)

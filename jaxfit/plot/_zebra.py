@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxfit._quality._zebra import Vector, zebra_grid
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit.plot._part import folds_in, of_fit, whole
-from jaxfit.plot._picture import blank_figure, save
+from jaxfit.plot._picture import blank_figure, finished
 from jaxfit.plot._render import FOLD, coarse_points, render
 from jaxfit.plot._view import View, choose_view, view_from
 
@@ -98,11 +97,7 @@ def zebra_stripes(
             axes[0, i].set_title(captions[i], fontsize=11)
     for place in axes.flat:
         place.set_axis_off()
-    if title:
-        figure.suptitle(title, fontsize=14, fontweight="bold")
-    if path is not None:
-        save(figure, Path(path), dpi)
-    return figure
+    return finished(figure, path, title, dpi)
 
 
 def _striped(
