@@ -62,6 +62,30 @@ def test_a_square_sheet_has_one_loop_and_fills_its_rectangle():
     assert layout.parameters.max() < 1
 
 
+def wing(seed, count):
+    """Points of both skins of a wing, all round its leading edge, open at the trailing one by less than most
+    neighbours are apart; on which skin each is, and at which share of the chord.
+    """
+    u, v = np.random.default_rng(seed).uniform(size=(2, count))
+    side, chord = np.sign(2 * u - 1), 1.5 - 0.8 * v
+    t = np.abs(2 * u - 1)
+    x = t**2
+    half = 0.6 * (0.2969 * t - 0.126 * x - 0.3516 * x**2 + 0.2843 * x**3 - 0.1015 * x**4)
+    return np.stack([chord * x + 0.9 * v, 5 * v, chord * side * (half + 0.02 * x)], axis=1), side, x
+
+
+@pytest.mark.parametrize(("seed", "count"), [(2, 6000), (5, 6000), (0, 12_000)])
+def test_the_skins_of_a_wing_are_joined_round_its_leading_edge_alone(seed, count):
+    points, side, chord_share = wing(seed, count)
+    sheet = sheet_of(points)
+    assert sheet.on_sheet.mean() > 0.99
+    assert len(sheet.loops) == 1
+    kept, share = sheet.number[sheet.on_sheet], chord_share[sheet.number[sheet.on_sheet]]
+    upper, lower = (sheet.places[sheet.on_sheet][(share > 0.8) & (side[kept] == s)] for s in (1, -1))
+    apart = np.quantile(np.linalg.norm(upper[:, None] - lower[None], axis=2), 0.05, axis=1)
+    assert np.quantile(apart, 0.1) > 0.2 * sheet.sides.max()
+
+
 def test_what_is_left_out_is_counted():
     points = square(20)
     far = points[::60] + np.array([0, 0, 0.4])

@@ -11,6 +11,7 @@ PLANES = 3  # times the plane is laid; each time, steps out of the last one coun
 CERTAIN = 0.9  # of the neighbours flat in the plane of a point: no other plane is tried
 CANDIDATES = 16  # neighbours whose planes are tried otherwise
 TILTED = np.cos(np.deg2rad(60.0))  # largest cosine with its own plane; less of a tilt may be noise or a bend
+LEVEL = 16  # power of the squared cosine of a step by which the neighbour has a say in the sign of a normal
 FLATNESS = 8  # power of the squared cosine of its slope by which a neighbour counts as flat in a plane
 
 
@@ -70,27 +71,30 @@ def oriented(
     """The normals with signs that agree along a tree of steps within the surface.
 
     After Hoppe et al. (1992), but with the slope of a step against both planes in its cost: the
-    tree goes round an edge from one sheet to the other rather than across the gap.
+    tree goes round an edge from one sheet to the other rather than across the gap. And normals are compared
+    with their mirror images in the middle of the step, as on an arc, however far it turns between two points
+    (Xie, Wang, Hua, Qin and Kaufman, 2003). In the end a point that most of its neighbours disagree with is
+    turned round.
     """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
     count = len(normals)
-    slope = np.abs(np.sum(unit * normals[:, None], axis=2))
-    other = np.abs(np.sum(unit * normals[members], axis=2))
-    deviation = 1 - np.abs(np.sum(normals[members] * normals[:, None], axis=2))
-    cost = 1e-9 + np.maximum(slope, other) ** 2 + deviation
-    rows = np.broadcast_to(np.arange(count)[:, None], members.shape)
-    graph = csr_array((cost[filled], (rows[filled], members[filled])), shape=(count, count))
-    tree = minimum_spanning_tree(graph)
+    slope, other = np.sum(unit * normals[:, None], axis=2), np.sum(unit * normals[members], axis=2)
+    alike = np.sum(normals[members] * normals[:, None], axis=2) - 2 * slope * other
+    steep = np.maximum(slope**2, other**2)
+    cost = 1e-9 + steep + 1 - np.minimum(np.abs(alike), 1.0)
+    steps = np.broadcast_to(np.arange(count)[:, None], members.shape)[filled], members[filled]
+    tree = minimum_spanning_tree(csr_array((cost[filled], steps), shape=(count, count)))
+    turns = csr_array((np.where(alike[filled] < 0, -1.0, 1.0), steps), shape=(count, count))
     sign, seen = np.ones(count), np.zeros(count, bool)
     for root in range(count):
         if seen[root]:
             continue
         order, before = breadth_first_order(tree, root, directed=False)
         seen[order] = True
-        for each in order[1:]:
-            parent = before[each]
-            agree = float(normals[each] @ normals[parent]) >= 0
-            sign[each] = sign[parent] if agree else -sign[parent]
-    return normals * sign[:, None]
+        parents = before[order[1:]]
+        for each, parent, turn in zip(order[1:], parents, turns[parents, order[1:]], strict=True):
+            sign[each] = sign[parent] * turn
+    votes = sign * np.sum(np.where(filled, alike * (1 - steep) ** LEVEL * sign[members], 0.0), axis=1)
+    return normals * np.where(votes < 0, -sign, sign)[:, None]

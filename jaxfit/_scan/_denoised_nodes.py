@@ -8,8 +8,8 @@ from jaxtyping import Float
 
 from jaxfit._scan._even_choice import even_choice
 
-NEIGHBOURS = 16  # of a point, whose plane tells its noise
-NOISY = 0.1  # of the spacing: usual distance from that plane, from which on a mesh of all points fails
+NEIGHBOURS = 16  # of a point, which tell its noise
+NOISY = 0.1  # of the spacing: usual distance from their surface, from which on a mesh of all points fails
 SHARES = 4, 16, 64  # points that a node stands for, tried one after the other
 PER_NODE = 6  # times as many make the plane that a node is moved to
 LEAST_NODES = 40
@@ -17,12 +17,21 @@ ENTRIES = 1 << 20  # neighbours at once
 
 
 def is_noisy(points: Float[Any, "points 3"]) -> bool:
-    """Whether distances from the planes of neighbours are comparable to those from neighbours."""
+    """Whether distances from quadratic surfaces of neighbours are comparable to those from neighbours.
+
+    From planes they are so on a bent sheet without noise, too.
+    """
     from scipy.spatial import cKDTree
 
-    spacing = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
-    away = np.linalg.norm(on_planes(points, NEIGHBOURS) - points, axis=1)
-    return bool(np.median(away) > NOISY * spacing)
+    tree = cKDTree(points)
+    spacing = float(np.median(tree.query(points, 2)[0][:, 1]))
+    near = points[tree.query(points, min(NEIGHBOURS, len(points)))[1]]
+    steps = near - near.mean(axis=1, keepdims=True)
+    frame = np.linalg.eigh(np.swapaxes(steps, 1, 2) @ steps)[1]
+    height, x, y = np.moveaxis(steps @ frame, 2, 0)
+    quadratic = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2))[0]
+    left = height - np.einsum("pik,pjk,pj->pi", quadratic, quadratic, height)
+    return bool(np.median(np.abs(left[:, 0])) > NOISY * spacing)
 
 
 def denoised_nodes(points: Float[Any, "points 3"]) -> Iterator[Float[Any, "nodes 3"]]:

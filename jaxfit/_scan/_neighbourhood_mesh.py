@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit._base import Planes, Stars, share_on_circles, stars, supported_planes
+from jaxfit._scan._bridges import without_bridges
 from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
 PLANE_NEIGHBOURS = 16  # of a point, that make its tangent plane
@@ -39,7 +40,8 @@ def neighbourhood_mesh(
     unlike = (np.sum(corners * np.roll(corners, 1, axis=1), axis=2) < ALIKE).any(axis=1)
     order = np.lexsort((longest, -votes, unlike))
     faces, agreed = _oriented(points, planes.normals, faces[order]), votes[order] >= least_votes
-    return manifold(faces[agreed], faces[~agreed] if is_grid or on_lines else None)
+    found = manifold(faces[agreed], faces[~agreed] if is_grid or on_lines else None)
+    return without_bridges(points, planes.normals, found)
 
 
 def _stars(planes: Planes) -> tuple[Stars, bool]:

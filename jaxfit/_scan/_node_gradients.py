@@ -37,8 +37,8 @@ def carried_places(
     away = np.linalg.norm(points - nodes[nearest], axis=1)
     step = np.einsum("pij,pj->pi", _gradients(nodes, faces, flat)[nearest], points - nodes[nearest])
     edge = np.median(np.linalg.norm(flat[faces[:, 0]] - flat[faces[:, 1]], axis=1))
-    length = np.linalg.norm(step, axis=1, keepdims=True)
-    step = step * np.minimum(1.0, REACH * edge / np.maximum(length, np.finfo(float).tiny))
+    length, most = np.linalg.norm(step, axis=1, keepdims=True), REACH * edge
+    step = step * np.where(length > most, most / np.maximum(length, most), 1.0)
     return flat[nearest] + np.where(away[:, None] > 0, step, 0.0), away
 
 
