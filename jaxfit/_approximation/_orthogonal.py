@@ -104,11 +104,11 @@ class OrthogonalDistance(AbstractIterativeMethod):
     The damping mu lies between 0 and 1. At 1 the step is that of `StandardApproximation`, which never fails:
     the distance at the old parameters is at least the new one. The first step has mu = 1, or less where
     `RegularSmoothing` begins at a base near the points. After it mu follows the ratio of the actual to the
-    predicted reduction of F. A step is rejected if F, measured at converged feet, has risen. It is
-    also rejected if a foot has moved by several cells and the reduction is less than predicted.
-    A rejected step counts as an iteration, with the errors of the surface before it. F is measured at local
-    feet. With `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and
-    taken again with more smoothing there.
+    predicted reduction of F. A step is rejected if F, measured at converged feet, has risen. It is also
+    rejected if a foot has moved by several cells and the reduction is less than predicted. A rejected step
+    counts as an iteration, with the errors of the surface before it. F is measured at local feet. With
+    `RegularSmoothing` a step is also rejected if the surface would fold where it did not, and taken again
+    with more smoothing there.
 
     Parameters
     ----------

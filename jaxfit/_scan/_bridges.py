@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._scan._manifold import Faces, directed_edges, longest_edges, pieces, single_fans
+from jaxfit._scan._manifold import Faces, euler, longest_edges, pieces, single_fans
 
 OPPOSED = -0.5  # cosine between the normals of two corners that face away from each other
 MOST_BRIDGES = 50  # more are not bridges but noise
@@ -27,18 +27,14 @@ def without_bridges(
     longest = [float(np.median(length[strip == k])) for k in range(int(strip.max()) + 1)]
     if len(longest) > MOST_BRIDGES:
         return faces
+    size, simple = _largest(faces), euler(faces)
     for k in np.argsort(longest)[::-1]:
         cut = single_fans(faces[strip != k])
-        if len(cut) and _largest(cut) > TIED * _largest(faces) and _euler(cut) > _euler(faces):
-            kept = strip != k
-            faces, strip = faces[kept], strip[kept]
+        if len(cut) and _largest(cut) > TIED * size and euler(cut) > simple:
+            faces, strip = faces[strip != k], strip[strip != k]
+            size, simple = _largest(cut), euler(cut)
     return single_fans(faces)
 
 
 def _largest(faces: Faces) -> int:
     return int(np.bincount(pieces(faces)).max())
-
-
-def _euler(faces: Faces) -> int:
-    edges = np.sort(directed_edges(faces), axis=1)
-    return len(np.unique(faces)) - len(np.unique(edges, axis=0)) + len(faces)

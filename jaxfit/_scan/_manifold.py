@@ -73,6 +73,12 @@ def directed_edges(faces: Faces) -> Int[Any, "edges 2"]:
     return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
+def euler(faces: Faces) -> int:
+    """Vertices less edges plus triangles: 2 less the boundary loops and twice the handles of one piece."""
+    edges, count = np.sort(directed_edges(faces), axis=1), int(faces.max()) + 1
+    return len(np.unique(faces)) - len(np.unique(edges[:, 0] * count + edges[:, 1])) + len(faces)
+
+
 def adjacent(faces: Faces) -> tuple[Int[Any, " pairs"], Int[Any, " pairs"]]:
     """Numbers of directed edges, 3 f + i, and of those that run back along them."""
     edges = directed_edges(faces)

@@ -9,8 +9,7 @@ from jaxfit._scan._manifold import (
     Faces,
     areas,
     boundary_loops,
-    directed_edges,
-    in_use,
+    euler,
     perimeter,
     pieces,
     vector_area,
@@ -61,14 +60,13 @@ def sheet_loops(points: Float[Any, "points 3"], faces: Faces) -> list[Int[np.nda
         raise ValueError(
             f"points must make a sheet with a rim, but their surface is closed like a sphere; {REMEDY}."
         )
-    vertices, edges = int(in_use(faces, len(points)).sum()), np.sort(directed_edges(faces), axis=1)
-    euler = vertices - len(np.unique(edges, axis=0)) + len(faces)
-    handles = (2 - len(loops) - euler) // 2
+    characteristic = euler(faces)
+    handles = (2 - len(loops) - characteristic) // 2
     if handles > 0:
         raise RoughError(
             f"points must make a disc with or without holes, but their surface has {handles} "
-            f"handle{'s' * (handles != 1)} (Euler characteristic {euler}, {len(loops)} boundary loops); "
-            f"{REMEDY}, or lower hole_length so that no bridge is made across a gap."
+            f"handle{'s' * (handles != 1)} (Euler characteristic {characteristic}, {len(loops)} boundary "
+            f"loops); {REMEDY}, or lower hole_length so that no bridge is made across a gap."
         )
     _check_no_tube(points, loops, area)
     return loops
