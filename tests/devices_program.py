@@ -36,7 +36,7 @@ def collectives(text):
         yield int(sum(sizes)), "while/body" in rest
 
 
-def on_all_devices(method):
+def on_all_devices(method, base, options):
     """The fit on all devices, and what its program sends."""
     texts = []
 
@@ -47,14 +47,14 @@ def on_all_devices(method):
 
     _sharded_fit.run_on_devices = run
     points, weights = jf.shard_points(ALL, MESH)
-    fit = jf.approximate(points, BASE, method, weights=weights, **OPTIONS)
+    fit = jf.approximate(points, base, method, weights=weights, **options)
     _sharded_fit.run_on_devices = RUN
     return fit, list(collectives(texts[0]))
 
 
 def compared(method):
     """The fit on all devices beside that on one."""
-    fit, sent = on_all_devices(method)
+    fit, sent = on_all_devices(method, BASE, OPTIONS)
     one = jf.approximate(ALL, BASE, method, **OPTIONS)
     history = [
         apart(getattr(fit.history, x), getattr(one.history, x)) for x in ("average", "maximum", "active")
@@ -72,16 +72,13 @@ def compared(method):
     }
 
 
-def apart_on_a_large_net():
-    """Nets of some 1,600 control points and more are enough for LAPACK's threads to divide work."""
+def on_a_large_net():
+    """Its system is solved by iterations."""
     base, method = noisy_sheet(COUNT, (42, 42))[1], METHODS["orthogonal"]
     options = OPTIONS | {"max_steps": 2}
-    points, weights = jf.shard_points(ALL, MESH)
-    fits = (
-        jf.approximate(points, base, method, weights=weights, **options),
-        jf.approximate(ALL, base, method, **options),
-    )
-    return apart(*(fit.surface.control_points for fit in fits))
+    fit, sent = on_all_devices(method, base, options)
+    one = jf.approximate(ALL, base, method, **options)
+    return {"net": apart(fit.surface.control_points, one.surface.control_points), "sent": sent}
 
 
 DIVIDED = jf.shard_points(ALL, MESH)[1]
@@ -124,7 +121,7 @@ def shared(method):
 def main():
     """Everything, as one line."""
     found = {name: compared(method) for name, method in METHODS.items()}
-    found["large"] = apart_on_a_large_net()
+    found["large"] = on_a_large_net()
     found["refused"] = {name: refusal(options) for name, options in REFUSED.items()}
     clouds = ALL[: CLOUDS * 300].reshape(CLOUDS, 300, 3)
     where = jax.sharding.NamedSharding(MESH, jax.sharding.PartitionSpec("points"))

@@ -1,4 +1,4 @@
-"""The fit of a cloud that is not finite."""
+"""The fit of a cloud that cannot be fitted."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ from jaxfit._fit._scaling import Unit
 from jaxfit._precision import working_dtype
 
 
-def failed_fit(request: Request, options: dict[str, Any]) -> Fit:
-    """A fit that ended before its first iteration: the base surface, and no errors."""
-    base, count, dtype = request.base, len(request.cloud), working_dtype()
+def failed_fit(request: Request, options: dict[str, Any], why: str) -> Fit:
+    """A fit that ended before its first iteration, `why` in a sentence: the base surface, and no errors."""
+    base, count, dtype = request.base, len(np.atleast_1d(request.cloud)), working_dtype()
     nothing, none = np.full(count, np.nan, dtype), np.zeros(1, np.int32)
     once, never = np.full(1, np.nan, dtype), np.zeros(1, bool)
     net = np.asarray([base.shape], np.int32)
@@ -36,6 +36,6 @@ def failed_fit(request: Request, options: dict[str, Any]) -> Fit:
         result=RESULTS.diverged,
         stats={
             **stats_of(default_method(request.method), tolerances, 0, unknown, count),
-            "points_not_finite": int((~np.isfinite(np.asarray(request.cloud)).all(axis=1)).sum()),
+            "refused": why,
         },
     )

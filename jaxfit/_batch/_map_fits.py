@@ -6,7 +6,6 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any
 
 import jax
-import numpy as np
 from jax.typing import ArrayLike
 
 from jaxfit._approximation import approximate
@@ -38,8 +37,9 @@ def map_fits(
     """The fits of many clouds, from many base surfaces or by many methods, side by side.
 
     Fit i is `approximate(clouds[i], base[i], method[i], weights=weights[i], **options)`. What is given once
-    is shared by all. A cloud that is not finite fails alone: its fit has not converged, and says why, and its
-    surface is the base. The other fits are the same to the bit.
+    is shared by all. A cloud that cannot be fitted fails alone (NaN in it, too few points or coordinates,
+    points that all coincide, weights that are negative or too few): its fit has not converged, and says why,
+    and its surface is the base. The other fits are the same to the bit.
 
     Parameters
     ----------
@@ -64,8 +64,8 @@ def map_fits(
     Raises
     ------
     ValueError, TypeError
-        Before anything is computed, as `approximate` does, with the number of the cloud; if the lists differ
-        in length, or nothing is a list.
+        Before anything is computed: for options and methods, as `approximate` does; for a cloud or weights
+        that hold no numbers, with its number; if the lists differ in length, or nothing is a list.
 
     Notes
     -----
@@ -95,12 +95,11 @@ def map_fits(
     if not is_concrete(requests, options):
         traced = one_by_one(lambda request: _fit(request, options), requests)
         return _raised(traced) if throw else tuple(traced)
-    for i, request in enumerate(requests):
-        _check(i, request, options)
-    finite = [i for i, x in enumerate(requests) if _is_finite(x)]
-    done = dict(zip(finite, _run([requests[i] for i in finite], executor, options), strict=True))
+    refused = [_refused(i, request, options) for i, request in enumerate(requests)]
+    fitted = iter(_run([x for x, why in zip(requests, refused, strict=True) if not why], executor, options))
     fits = tuple(
-        done[i] if i in done else failed_fit(x, {**_OPTIONS, **options}) for i, x in enumerate(requests)
+        failed_fit(request, {**_OPTIONS, **options}, why) if why else next(fitted)
+        for request, why in zip(requests, refused, strict=True)
     )
     return _raised(fits) if throw else fits
 
@@ -158,23 +157,21 @@ def _raised(fits: Sequence[Fit]) -> tuple[Fit, ...]:
     return tuple(converged_or_raise(fit) for fit in fits)
 
 
-def _check(index: int, request: Request, options: dict[str, Any]) -> None:
-    """Raise the sentence of `approximate`, with the number of the cloud, for anything but a NaN in it."""
+def _refused(index: int, request: Request, options: dict[str, Any]) -> str:
+    """Why the points or weights of a request can't be fitted, in the words of `approximate`, "" if they can.
+
+    What is no matter of one cloud's numbers is raised.
+    """
     try:
         check_options(request.method, progress=None, throw=False, **{**_OPTIONS, **options})
-        numbers = request.cloud if _is_finite(request) else np.zeros_like(request.cloud)
-        cloud = as_points("points", numbers, request.base.dimension, least=LEAST_POINTS)
-        if _is_finite(request):
+        try:
+            cloud = as_points("points", request.cloud, request.base.dimension, least=LEAST_POINTS)
             checked_request(cloud, request.base.domain, weights=request.weights)
+        except ValueError as error:
+            return str(error)
     except (ValueError, TypeError) as error:
         raise type(error)(f"clouds[{index}]: {error}") from error
-
-
-def _is_finite(request: Request) -> bool:
-    try:
-        return bool(np.isfinite(np.asarray(request.cloud)).all())
-    except (TypeError, ValueError):
-        return True  # it holds no numbers, which is said in the sentence of `approximate`
+    return ""
 
 
 def _check_names(options: dict[str, Any]) -> None:

@@ -206,8 +206,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = f"{sentence.removesuffix('.')} by the {first}{advice}."
     if missed and _is_of_cloud(fit) and fit.result == RESULTS.stalled and not fit.stats["tol_average"]:
         sentence = "the errors have stopped falling."
-    if missed and (count := int(fit.stats.get("points_not_finite", 0))):
-        return f"{_said_points(count)} NaN or infinite, so nothing was fitted; remove or repair them."
+    if why := fit.stats.get("refused"):
+        return f"nothing was fitted: {why}"
     beyond = share_beyond_border(fit) if missed else 0.0
     outliers = share_of_outliers(fit) if missed and beyond <= MUCH else 0.0
     if beyond > MUCH:
