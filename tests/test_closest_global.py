@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxfit import BSplineCurve, BSplineSurface, HuWallner, Newton, PointStatus, closest_point
-from jaxfit._closest import _candidates, _chunks, nearest_feet, starting_feet
+from jaxfit._closest import _candidates, _chunks, _surface_search, nearest_feet, starting_feet
 from jaxfit._closest._candidates import Search
 from jaxfit._splines._pieces import make_axis
 
@@ -85,6 +85,22 @@ def test_a_cloud_in_chunks_has_the_feet_of_the_whole(wavy, monkeypatch):
         assert feet.converged.all()
         np.testing.assert_allclose(feet.distance, expected.distance, rtol=0, atol=1e-12)
         np.testing.assert_allclose(feet.point, expected.point, rtol=0, atol=1e-9)
+
+
+def test_candidates_are_tried_for_a_few_points_at_a_time(wavy, monkeypatch):
+    points, _, _ = queries(wavy)
+    whole, counts, candidates = closest_point(wavy, points), [], Search.candidates
+    monkeypatch.setattr(_surface_search, "MOST_POINTS", 50)
+
+    def counted(search, some, *feet):
+        counts.append(len(some))
+        return candidates(search, some, *feet)
+
+    monkeypatch.setattr(Search, "candidates", counted)
+    feet = closest_point(wavy, points)
+    assert len(counts) > 2
+    assert max(counts) == 50
+    np.testing.assert_allclose(feet.distance, whole.distance, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["blade_wrap_3000", "mannequin_head"])

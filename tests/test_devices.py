@@ -47,7 +47,7 @@ def test_a_large_net_on_eight_devices_comes_to_an_end(eight):
     assert eight["large"]["net"] < 1e-10
 
 
-@pytest.mark.parametrize("name", (*METHODS, "large"))
+@pytest.mark.parametrize("name", [*METHODS, "large"])
 def test_only_sums_of_the_size_of_the_net_go_between_devices(eight, name):
     sent = eight[name]["sent"]
     in_loop = [size for size, repeated in sent if repeated]

@@ -14,7 +14,7 @@ from jaxfit._closest._samples import sample
 from jaxfit._remembered import remembered
 from jaxfit._splines._pieces import Axis
 
-MOST_STARTS = 1 << 16  # tried at a time, for the memory's sake
+MOST_POINTS, MOST_STARTS = 1 << 14, 1 << 16  # looked at at a time, for the memory's sake
 # Where cells are few the reach costs little, and it spares searches that exchange feet for the same ones with
 # other last digits.
 LEAST_POINTS_PER_CELL = 24
@@ -71,6 +71,10 @@ class SurfaceSearch:
             return
         # In the tree neighbours are found faster one after the other.
         left = left[neighbours_together(self.projector.axes, best["u"][left], best["v"][left])]
+        for begin in range(0, left.size, MOST_POINTS):
+            self._try_candidates_of(left[begin : begin + MOST_POINTS], best)
+
+    def _try_candidates_of(self, left: np.ndarray, best: HostFeet) -> None:
         distance = np.sqrt(best["f"][left].astype(np.float64))
         points = np.ascontiguousarray(self.projector.centred.T[left])
         candidates = self.samples.candidates(points, best["u"][left], best["v"][left], distance)
