@@ -17,8 +17,8 @@ _CODES = {FITTED: 0, MISSED: 1, FAILED: 3}
 def batch_command(args: argparse.Namespace) -> int:
     """Fit the files that are not yet in the table; return the exit code."""
     folder = Path(args.output)
-    jobs = _jobs(args, folder)
     table = Table(folder)
+    jobs = _jobs(args, folder, table)
     left = [job for job in jobs if not table.is_done(job.row, args.retry_failed)]
     if left:
         _fit_all(args, left, table)
@@ -34,18 +34,20 @@ def batch_command(args: argparse.Namespace) -> int:
     return max(_CODES[row["status"]] for row in rows)
 
 
-def _jobs(args: argparse.Namespace, folder: Path) -> list[Job]:
-    """A job for each file; refuses two that would write the same surface, before anything is done."""
+def _jobs(args: argparse.Namespace, folder: Path, table: Table) -> list[Job]:
+    """A job for each file; refuses two that would write the same surface, before anything is done, be it one
+    of an earlier run.
+    """
     for name in args.inputs:
         _check_name(name)
     jobs = {job.row["input"]: job for job in (job_of(args, name) for name in args.inputs)}
-    taken: dict[str, str] = {}
+    taken = table.owners()
     for name, job in jobs.items():
         other = taken.setdefault(job.row["surface"], name)
         if other != name:
             raise io.InputError(
-                f"{other} and {name} would both write {job.row['surface']}; rename one, or give them folders "
-                "of their own."
+                f"{other} and {name} would both write {job.row['surface']} in {folder}; rename one, or give "
+                "them folders of their own."
             )
     arguments = [job.arguments for job in jobs.values()]
     name = read_and_written(arguments, (x["output"] for x in arguments))

@@ -40,8 +40,17 @@ class Table:
             return not again
         return row["surface"] == wanted["surface"] and (self.folder / row["surface"]).is_file()
 
+    def owners(self) -> dict[str, str]:
+        """The inputs that there still are, by the surface that was made of each."""
+        rows = self.rows.items()
+        return {row["surface"]: name for name, row in rows if row["surface"] and Path(name).exists()}
+
     def put(self, row: Row) -> None:
-        """Take a row in; it is written now, or after a rest that keeps writing cheap."""
+        """Take a row in; it is written now, or after a rest that keeps writing cheap. Who had its surface
+        before, an input that is gone, has no row any more.
+        """
+        mine = row["surface"]
+        self.rows = {name: x for name, x in self.rows.items() if mine is None or x["surface"] != mine}
         self.rows[row["input"]] = {name: row.get(name) for name in COLUMNS}
         self._unwritten = True
         self.write_if_rested()

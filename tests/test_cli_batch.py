@@ -128,6 +128,20 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
     assert list(rows()) == ["nan.npz", "grid.npz", "a.npz"]
 
 
+def test_a_surface_of_an_earlier_run_is_not_written_over_while_its_input_is_there(folder, capsys):
+    (folder / "other").mkdir()
+    (folder / "other" / "a.npz").write_bytes((folder / "b.npz").read_bytes())
+    assert batch("a.npz") == 0
+    before = state()
+    capsys.readouterr()
+    assert batch("other/a.npz") == 2
+    assert "would both write a.npz in out; rename one" in capsys.readouterr().err
+    assert state() == before
+    os.unlink("a.npz")
+    assert batch("other/a.npz") == 0
+    assert [row["input"] for row in rows().values()] == [str(folder / "other" / "a.npz")]
+
+
 @pytest.mark.parametrize(
     ("argv", "said"),
     [

@@ -93,8 +93,9 @@ def _regularity_facts(fit: Any) -> dict[str, str]:
     if not _is_finite(fit):
         return {}
     found: Regularity = fit.regularity
-    unit = float(fit.stats.get("diagonal", 1.0)) ** 2
-    energy = f"thin plate {found.thin_plate_energy / unit:.4g} squared diagonals"
+    unit = float(fit.stats.get("diagonal", 1.0))
+    # Divided twice, for its square may be less than the least number.
+    energy = f"thin plate {found.thin_plate_energy / unit / unit:.4g} squared diagonals"
     if found.curvature_energy is not None:
         energy += f", curvature {found.curvature_energy:.4g}"
     without = {} if not found.degenerate else {"no normal": f"at {found.degenerate:,} of {_samples(found)}"}
