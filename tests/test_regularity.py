@@ -219,6 +219,8 @@ def test_a_fit_without_folds_says_how_regular_it_is():
     plate = fit.regularity.thin_plate_energy / float(fit.stats["diagonal"]) ** 2
     assert lines["energies"].startswith(f"thin plate {plate:.4g} squared diagonals, curvature ")
     assert "degrees apart, ratio" in lines["parameter"]
+    tiny = jf.interpolate(1e-200 * wavy_grid(12, 9))  # whose diagonal has no square
+    assert lines["parameter"] in str(tiny)
 
 
 def test_a_cloud_that_missed_its_tolerance_tells_of_folds_in_a_sentence_of_their_own():
