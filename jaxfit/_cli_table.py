@@ -38,7 +38,8 @@ class Table:
             return False
         if row["status"] == FAILED:
             return not again
-        return row["surface"] == wanted["surface"] and (self.folder / row["surface"]).is_file()
+        surface = self.folder / row["surface"]
+        return row["surface"] == wanted["surface"] and surface.is_file() and surface.stat().st_size > 0
 
     def owners(self) -> dict[str, str]:
         """The inputs that there still are, by the surface that was made of each."""

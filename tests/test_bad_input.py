@@ -91,6 +91,25 @@ def test_a_column_that_counts_the_points_is_refused(tmp_path, first, name):
     np.testing.assert_array_equal(read_points(tmp_path / name).points, POINTS)
 
 
+@pytest.mark.parametrize(
+    "numbers",
+    [np.arange(1000, 1060), 10 * np.arange(60), np.delete(np.arange(1, 62), 7), np.arange(60)[::-1]],
+    ids=["from 1000", "in tens", "with a gap", "backwards"],
+)
+def test_a_column_that_numbers_the_points_is_refused(tmp_path, numbers):
+    path = tmp_path / "a.csv"
+    np.savetxt(path, np.column_stack([numbers, POINTS]), delimiter=",")
+    said = f"the first column only numbers the points, from {numbers.min()} to {numbers.max()}; remove it, or"
+    with pytest.raises(InputError, match=said):
+        read_points(path)
+    repeated = np.column_stack([numbers - numbers % 20, POINTS])
+    np.savetxt(path, repeated, delimiter=",")
+    np.testing.assert_array_equal(read_points(path).points, repeated[:, :3])
+    whole = np.column_stack([numbers, numbers % 7, POINTS])
+    np.savetxt(path, whole, delimiter=",")
+    np.testing.assert_array_equal(read_points(path).points, whole[:, :3])
+
+
 @pytest.mark.parametrize(("name", "delimiter"), [("a.csv", ","), ("a.xyz", " ")])
 @pytest.mark.parametrize("names", ["n x y z", "z y x w", 'w "Z" "X" "Y"'])
 def test_columns_are_found_by_their_names(tmp_path, name, delimiter, names):

@@ -121,6 +121,8 @@ def test_what_has_changed_is_fitted_again(folder, monkeypatch):
     assert run("a.npz", "grid.npz") == (0, ["a.npz"])
     os.unlink("out/grid.npz")
     assert run("a.npz", "grid.npz") == (0, ["grid.npz"])
+    os.truncate("out/grid.npz", 0)
+    assert run("a.npz", "grid.npz") == (0, ["grid.npz"])
     assert run("grid.npz", "--tol-maximum", "1e-9") == (1, ["grid.npz"])
     (folder / "a.npz").write_text("no points any more")
     assert run("a.npz") == (3, ["a.npz"])

@@ -284,6 +284,20 @@ def test_outliers_above_the_border_are_not_beyond_it(base):
     assert "outliers" not in counted.message
 
 
+def test_a_fit_that_leaves_a_nearer_surface_says_so(base):
+    points = np.array(base(*np.random.default_rng(0).uniform(0.1, 0.9, (2, 500))))
+    points[:10, 2] += 0.3
+    before, fit = (jf.approximate(points, base, max_steps=n, tol_average=1e-5) for n in (0, 5))
+    assert fit.average_error > before.average_error
+    said = f"The surface that it started from is nearer on average ({100 * before.average_error:.3g} %)."
+    assert said in fit.message
+    assert "nearer on average" not in before.message
+    robust = jf.approximate(
+        points, base, jf.OrthogonalDistance(loss=jf.Tukey()), max_steps=5, tol_average=1e-5
+    )
+    assert "nearer on average" not in robust.message
+
+
 def test_held_and_untouched_control_points_keep_every_bit(base):
     surface = base.affine(np.eye(3), np.array([0.1, 0.2, 0.3]))
     some = POINTS[(POINTS[:, 0] < 0.3) & (POINTS[:, 1] < 0.4)] + np.array([0.1, 0.2, 0.3])

@@ -276,8 +276,8 @@ def test_a_bad_boundary_is_refused(tmp_path):
         ("a.xyz", "0 0 0\n1 1 1\n\n1 0\n0 1 1\n", "line 4 has 2 columns"),
         ("a.csv", "x,y,z\n0,0,0\n1,one,1\n", "line 3 has 'one' in place of a number"),
         ("a.csv", "0,0,0\n1,,1\n", "line 2 has '' in place of a number"),
-        ("a.csv", "0 0 0\n1 1 1\n", "line 1 has 1 column, but a point has three"),
-        ("a.xyz", "0,0,0\n1,1,1\n", "separate x, y and z by blanks"),
+        ("a.csv", "0\n1\n", "line 1 has 1 column, but a point has three"),
+        ("a.xyz", "0,0\n1,1\n", "separate x, y and z by blanks"),
         ("a.xyz", "0 0 0\n1 nan 1\n0 1 inf\n1 1 1\n", "2 of 4 points have NaN"),
         ("a.xyz", "# c\n0 0 0\n1 nan 1\n0 1 0\n1 1 1\n", "the first in line 3"),
         ("a.xyz", "0 0 0\n1 0 1\n0 1 0\n", "3 points, but a surface needs at least 4"),
@@ -305,6 +305,30 @@ def test_numbers_may_stand_in_quotes_and_commas_before_blanks(tmp_path):
     spaced = "".join(", ".join(map(str, row)) + "\n" for row in rows)
     for name in ("c.xyz", "c.txt", "c.csv"):
         np.testing.assert_array_equal(read_points(text(tmp_path / name, spaced)).points, rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.txt", "0.5,0,0\n1,1.5,0\n0,1,-2e3\n1,0,4\n"),
+        ("a.xyz", "0.5,0,0,\n1,1.5,0,\n0,1,-2e3,\n1,0,4,\n"),
+        ("a.csv", "x y z\n0.5 0 0\n1 1.5 0\n0 1 -2e3\n1 0 4\n"),
+        ("a.csv", "4\n0.5,0,0\n1,1.5,0\n0,1,-2e3\n1,0,4\n"),
+        ("a.xyz", "4\n0.5 0 0\n1 1.5 0\n0 1 -2e3\n1 0 4\n"),
+    ],
+)
+def test_columns_may_be_separated_otherwise_and_their_number_may_come_first(tmp_path, name, content):
+    expected = [(0.5, 0, 0), (1, 1.5, 0), (0, 1, -2e3), (1, 0, 4)]
+    np.testing.assert_array_equal(read_points(text(tmp_path / name, content)).points, expected)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_text_may_be_in_the_usual_encodings(tmp_path, encoding):
+    path = tmp_path / "a.csv"
+    path.write_bytes("# Gerät 7\nx,y,z,Höhe\n0.5,0,0,1\n1,1.5,0,1\n0,1,-2e3,1\n1,0,4,1\n".encode(encoding))
+    np.testing.assert_array_equal(read_points(path).points[2], [0, 1, -2e3])
+    path.write_bytes(b"0,0,0\n\x00\xff\n")
+    assert "a.csv holds no plain text; save it as text in UTF-8" in sentence(path)
 
 
 def test_packed_text_is_to_be_unpacked(tmp_path):

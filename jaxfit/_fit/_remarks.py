@@ -1,4 +1,6 @@
-"""Sentences that a fit's reason is followed by: on points beyond the border, outliers, and sides far away."""
+"""Sentences that a fit's reason is followed by: on points beyond the border, outliers, the surface that it
+started from, and sides far away.
+"""
 
 from typing import Any
 
@@ -10,6 +12,7 @@ MUCH, MOST = 0.05, 0.5  # shares of the sum of errors
 # Outliers: the errors of FEW points make MOST of the sum, the largest is EXTREME times the median, and that
 # is at most NEAR times the tolerance.
 FEW, EXTREME, NEAR = 0.05, 30.0, 2.0
+NEARER = 0.95  # of an average error, where it is worth saying
 
 
 def share_beyond_border(fit: Any) -> float:
@@ -61,6 +64,16 @@ def with_outliers(fit: Any, sentence: str, share: float) -> str:
         f"{sentence} {share:.0%} of all errors are those of {FEW:.0%} of the points; if these are outliers, "
         f"judge the surface by the others{advice}."
     )
+
+
+def with_start(fit: Any, sentence: str) -> str:
+    """The reason, and that the surface that the fit started from is nearer on average, if it is: squares may
+    fall while that rises.
+    """
+    averages, now = np.asarray(fit.history.average), float(fit.average_error)
+    if not (averages.ndim == 1 and averages.size and averages[0] < NEARER * now < np.inf):
+        return sentence
+    return f"{sentence} The surface that it started from is nearer on average ({100 * averages[0]:.3g} %)."
 
 
 def with_sides(sentence: str, far: dict[str, Any]) -> str:

@@ -16,6 +16,7 @@ from jaxfit._fit._remarks import (
     with_border,
     with_outliers,
     with_sides,
+    with_start,
 )
 from jaxfit._quality import Regularity
 from jaxfit._splines import BSplineSurface
@@ -215,6 +216,8 @@ def said_reason(fit: Any, sentence: str) -> str:
         sentence = with_border(fit, sentence, beyond)
     if outliers:
         sentence = with_outliers(fit, sentence, outliers)
+    if missed and _is_of_cloud(fit):
+        sentence = with_start(fit, sentence)
     if is_single(fit) and (far := fit.stats.get("far_sides")):
         sentence = with_sides(sentence, far)
     if missed and beyond <= MOST and not outliers and fit.stats.get("points_out_of_reach", 0) > 0:

@@ -31,7 +31,8 @@ def read_points(path: str | os.PathLike) -> PointData:
     - ``.npy``: one array, (N, 3) scattered or (n, m, 3) grid
     - ``.csv``: scattered, one point a line, commas, semicolons or tabs; a first line may hold names, of more
       than three columns those of x, y and z (also ``X [mm]``, ``x_mm``, ...) wherever they stand
-    - ``.xyz``, ``.txt``: the same with blanks instead of commas
+    - ``.xyz``, ``.txt``: the same with blanks instead of commas. Each kind may have the separators of the
+      other, and begin with the number of points
     - ``.ply``, ``.stl``, ``.obj``, ``.off``: the vertices of a mesh; the points of a ``.ply``, ``.obj`` or
       ``.off`` without faces (trimesh)
     - ``.las``, ``.laz``: a survey, with the scale and offset of the file (laspy, lazrs)

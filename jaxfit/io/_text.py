@@ -10,6 +10,7 @@ from jaxfit.io._point_data import MOST_COLUMNS, InputError
 
 FIRST = 0, 1, 2
 _PACKED = b"\x1f\x8b", b"PK"  # how files of gzip and zip begin
+_UTF_16 = b"\xff\xfe", b"\xfe\xff"
 _SAID = 8  # names of columns in a sentence
 _DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", None: "blanks"}
 _UNIT = r"(?:[_\s](?:[munkcdµμ]?m|in|ft)|\s*[/(\[#].*)?"  # of a name: x_mm, x mm, X [mm], X (mm), x/mm
@@ -17,26 +18,20 @@ _UNIT = r"(?:[_\s](?:[munkcdµμ]?m|in|ft)|\s*[/(\[#].*)?"  # of a name: x_mm, x
 
 def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
     """The columns x, y and z of a text file, or the first three: between semicolons if its first point has
-    some, else commas or tabs in .csv, blanks otherwise.
+    some, else commas or tabs in .csv, blanks otherwise, or whichever of them there are.
 
     Raises
     ------
     InputError
         With the line number, for anything that is not a finite number.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    except UnicodeDecodeError as error:
-        packed = path.read_bytes()[:2] in _PACKED
-        remedy = "is packed; unpack it" if packed else "holds no plain text; save it as text in UTF-8"
-        raise InputError(f"{path} {remedy}.") from error
     lines = [
         (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
+        for number, line in enumerate(_text(path).splitlines(), start=1)
         if (stripped := line.strip()) and not stripped.startswith("#")
     ]
+    if len(lines) > 1 and lines[0][1].strip() == str(len(lines) - 1):  # how many points follow
+        lines.pop(0)
     header = lines.pop(0)[1] if lines and _is_header(lines[0][1]) else ""
     if not lines:
         raise InputError(f"{path} holds no points; write one point a line.")
@@ -62,8 +57,24 @@ def read_columns(path: Path) -> Float[np.ndarray, "points 3"]:
             "them."
         )
     if named is None:
-        _check_first_column(path, values[:, 0], found)
+        _check_first_column(path, values, found)
     return values
+
+
+def _text(path: Path) -> str:
+    """The file in UTF-8, or what its first bytes say; comments may be in Latin-1."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
+    if raw[:2] in _PACKED:
+        raise InputError(f"{path} is packed; unpack it.")
+    try:
+        return raw.decode("utf-16" if raw[:2] in _UTF_16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        if b"\0" in raw:
+            raise InputError(f"{path} holds no plain text; save it as text in UTF-8.") from error
+        return raw.decode("latin-1")
 
 
 def _delimiter(path: Path, first: str) -> str | None:
@@ -72,9 +83,12 @@ def _delimiter(path: Path, first: str) -> str | None:
         return ";"
     if re.fullmatch(r"\s*[^\s,]+(,\s+[^\s,]+)+,?\s*", first):  # before a blank it is no decimal comma
         return ","
+    blanks = len(first.split()) > 1
     if path.suffix.lower() != ".csv":
-        return None
-    return "\t" if "\t" in first and "," not in first else ","
+        return "," if first.count(",") > 1 and not blanks else None
+    if "," in first or not blanks:
+        return ","
+    return "\t" if "\t" in first else None
 
 
 def _named_columns(path: Path, names: list[str], found: int, title: bool) -> tuple[int, int, int] | None:
@@ -151,11 +165,19 @@ def _check_columns(path: Path, lines: list[tuple[int, str]], delimiter: str) -> 
             )
 
 
-def _check_first_column(path: Path, first: np.ndarray, columns: int) -> None:
-    """Raise if the first of four or more columns only counts the points, from 0 or 1."""
-    if columns >= 4 and len(first) >= 4 and first[0] in (0, 1) and (np.diff(first) == 1).all():
+def _check_first_column(path: Path, values: np.ndarray, columns: int) -> None:
+    """Raise if the first of four or more columns only counts the points, from 0 or 1, or numbers them: if it
+    holds whole numbers, each once, and the next two do not.
+    """
+    first, whole = values[:, 0], values == np.floor(values)
+    if columns < 4 or len(first) < 4 or not whole[:, 0].all():
+        return
+    counts = first[0] in (0, 1) and (np.diff(first) == 1).all()
+    numbers = not whole[:, 1:].all(axis=0).any() and len(np.unique(first)) == len(first)
+    if counts or numbers:
+        does = "counts" if counts else "numbers"
         raise InputError(
-            f"{path}: the first column only counts the points, from {first[0]:.0f} to {first[-1]:.0f}; "
+            f"{path}: the first column only {does} the points, from {first.min():.0f} to {first.max():.0f}; "
             "remove it, or name the columns x, y and z in the first line."
         )
 
