@@ -67,13 +67,13 @@ def _text(path: Path) -> str:
         raw = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from error
-    if raw[:2] in _PACKED:
-        raise InputError(f"{path} is packed; unpack it.")
     try:
         return raw.decode("utf-16" if raw[:2] in _UTF_16 else "utf-8-sig")
     except UnicodeDecodeError as error:
-        if b"\0" in raw:
-            raise InputError(f"{path} holds no plain text; save it as text in UTF-8.") from error
+        packed = raw[:2] in _PACKED
+        if packed or b"\0" in raw:
+            remedy = "is packed; unpack it" if packed else "holds no plain text; save it as text in UTF-8"
+            raise InputError(f"{path} {remedy}.") from error
         return raw.decode("latin-1")
 
 
