@@ -136,16 +136,16 @@ def fit_points(
     are met; without a `tol_maximum` finer nets are tried, too, while a whole patch (by the median of nine
     points whose feet are neighbours) is ten times `tol_average` away, as long as they bring it a fifth
     nearer (`tol_maximum=1.0` asks for the average alone). Growth also ends where the tenth of the points
-    that was held out comes no nearer to the surface, by 1.5 % of its average error, as the net gets finer:
-    what is left is noise, and the net before is taken. Where errors of neighbours correlate by 0.5 or more,
-    which those of noise do not, four finer nets are tried first. And it ends with two points for a control
-    point, without a boundary three; or with 200 control points each way, without a boundary 96. With a
-    boundary the net that this ends with is also fitted from a base surface of its own, as if it had been
-    given: that fit is taken if it meets the tolerances as well, has no more folds and less curvature energy
-    (9), for what coarser nets cannot follow bends parameter lines. The last fit is one to all points. Each
-    net takes at most 20 iterations, the last up to `max_steps` where the tolerances can be met. Of more than
-    20,000 points every second, third and so on choose it: 10,000 to 20,000 of them, or for finer nets at
-    least 12 for each control point.
+    that was held out comes no nearer to the surface as the net gets finer, by 1.5 % of its average error, or
+    by 0.3 % while errors of neighbours correlate by 0.05 or more: what is left is noise, and the net before
+    is taken. Where they correlate by 0.5 or more, four finer nets are tried first. And it ends with two
+    points for a control point, without a boundary three; or with 200 control points each way, without a
+    boundary 96. With a boundary the net that this ends with is also fitted from a base surface of its own, as
+    if it had been given: that fit is taken if it meets the tolerances as well, has no more folds and less
+    curvature energy (9), for what coarser nets cannot follow bends parameter lines. The last fit is one to
+    all points. Each net takes at most 20 iterations, the last up to `max_steps` where the tolerances can be
+    met. Of more than 20,000 points every second, third and so on choose it: 10,000 to 20,000 of them, or for
+    finer nets at least 12 for each control point.
 
     Without a boundary each point has its Delaunay star in its own tangent plane, and triangles on which
     stars agree make the mesh. It is laid out flat with little distortion and no flipped triangle (symmetric

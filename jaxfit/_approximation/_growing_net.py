@@ -29,6 +29,9 @@ GROWTH, MOST_FACTORS = 1.2, 2
 # What the size has to grow by in the end is at least this power of how many times too large an error is.
 SIZE_OF_EXCESS = 0.6
 BETTER = 0.985  # what the held-out error has to fall to, as a multiple of that with a coarser net
+# Much noise hides what a finer net gains: where the errors of neighbours with the coarser one correlate by
+# LIKE_NOISE or more, which those of noise hardly do among thousands, so little is enough.
+LIKE_NOISE, A_LITTLE_BETTER = 0.05, 0.997
 # Where it does not, but the errors of neighbours are so much alike that they are no noise, so many finer nets
 # are tried all the same: waves that a net is too coarse for take several to be found.
 ALIKE, PATIENCE = 0.5, 4
@@ -143,7 +146,7 @@ class NetGrowth:
                 met = level
                 if level.beside.farthest <= self.far:
                     return met, RESULTS.converged
-            if best is None or level.held_out < BETTER * best.held_out or met is not None:
+            if best is None or met is not None or self._is_better(level, best):
                 best, waited = level, 0
             elif waited == PATIENCE or not level.beside.correlation >= ALIKE:
                 return best, RESULTS.noise_reached
@@ -154,6 +157,11 @@ class NetGrowth:
             if not self.allows(size) or self.net(size) == self.net(coarser):
                 return best, RESULTS.net_exhausted if met is None else RESULTS.converged
             base, before = self.nets.carried(level.fit.surface, self.net(size)), level
+
+    def _is_better(self, level: Level, best: Level) -> bool:
+        """Whether points that were held out are nearer to a finer net, by more than chance may bring them."""
+        enough = A_LITTLE_BETTER if best.beside.correlation >= LIKE_NOISE else BETTER
+        return level.held_out < enough * best.held_out
 
     def _is_met(self, level: Level) -> bool:
         """Whether the tolerances that were asked for are met: `far`, a maximum for some levels, is none."""
