@@ -30,10 +30,10 @@ GROWTH, MOST_FACTORS = 1.2, 2
 SIZE_OF_EXCESS = 0.6
 BETTER = 0.985  # what the held-out error has to fall to, as a multiple of that with a coarser net
 # Much noise hides what a finer net gains: where the errors of neighbours with the coarser one correlate by
-# LIKE_NOISE or more, which those of noise hardly do among thousands, so little is enough.
-LIKE_NOISE, A_LITTLE_BETTER = 0.05, 0.997
-# Where it does not, but the errors of neighbours are so much alike that they are no noise, so many finer nets
-# are tried all the same: waves that a net is too coarse for take several to be found.
+# NOISE_CORRELATION or more, which those of noise hardly do among thousands, so little is enough.
+NOISE_CORRELATION, A_LITTLE_BETTER = 0.05, 0.997
+# Where it falls less, but the errors of neighbours are so much alike that they are no noise, so many finer
+# nets are tried all the same: waves that a net is too coarse for take several to be found.
 ALIKE, PATIENCE = 0.5, 4
 LEVEL_STEPS = 20  # iterations with each net but the last
 # Without a tolerance for the maximum a net is too coarse, too, while a whole patch, a point and most of those
@@ -160,7 +160,7 @@ class NetGrowth:
 
     def _is_better(self, level: Level, best: Level) -> bool:
         """Whether points that were held out are nearer to a finer net, by more than chance may bring them."""
-        enough = A_LITTLE_BETTER if best.beside.correlation >= LIKE_NOISE else BETTER
+        enough = A_LITTLE_BETTER if best.beside.correlation >= NOISE_CORRELATION else BETTER
         return level.held_out < enough * best.held_out
 
     def _is_met(self, level: Level) -> bool:

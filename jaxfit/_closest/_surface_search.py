@@ -14,7 +14,7 @@ from jaxfit._closest._samples import sample
 from jaxfit._remembered import remembered
 from jaxfit._splines._pieces import Axis
 
-MOST_POINTS, MOST_STARTS = 1 << 14, 1 << 16  # looked at at a time, for the memory's sake
+MOST_POINTS, MOST_STARTS = 1 << 14, 1 << 16  # tried in one go, for the memory's sake
 # Where cells are few the reach costs little, and it spares searches that exchange feet for the same ones with
 # other last digits.
 LEAST_POINTS_PER_CELL = 24
@@ -75,6 +75,7 @@ class SurfaceSearch:
             self._try_candidates_of(left[begin : begin + MOST_POINTS], best)
 
     def _try_candidates_of(self, left: np.ndarray, best: HostFeet) -> None:
+        """`try_candidates` of MOST_POINTS at most."""
         distance = np.sqrt(best["f"][left].astype(np.float64))
         points = np.ascontiguousarray(self.projector.centred.T[left])
         candidates = self.samples.candidates(points, best["u"][left], best["v"][left], distance)
