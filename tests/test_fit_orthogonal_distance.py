@@ -10,7 +10,9 @@ from normal_reference import thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._approximation._damping import (
+    FINE,
     LEAST_DAMPING,
+    USUAL_DAMPING,
     DampingState,
     actual_gain,
     is_no_worse,
@@ -206,14 +208,22 @@ def test_no_step_is_kept_that_makes_the_distances_worse(base):
 
 def test_damping_follows_the_fall_that_was_predicted(base):
     surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v)
-    now = [0.1, 0.1, 0.1, 0.1, 1e-12, 0.5]
-    gain, good = [0.9, 0.4, 0.1, -1.0, 1.0, -1.0], [True, True, True, False, True, False]
-    expected = [0.025, 0.1, 0.4, 1.0, LEAST_DAMPING, 1.0]
-    for mu, fell, kept, after in zip(now, gain, good, expected, strict=True):
+    cases = [  # damping, mean distance, objective, gain, accepted, next damping
+        (0.1, 1.0, 1.5, 0.9, True, 0.025),
+        (0.1, 1.0, 1.5, 0.4, True, 0.1),
+        (0.1, 1.0, 1.5, 0.1, True, 0.4),
+        (0.1, 1.0, 1.5, -1.0, False, 1.0),
+        (1e-12, 1.0, 1.5, 1.0, True, LEAST_DAMPING),
+        (0.5, 1.0, 1.5, -1.0, False, 1.0),
+        (1e-4, 1.0, 20.0, 1.0, True, USUAL_DAMPING),  # a twentieth of the objective is no good part of it
+        (1e-4, 0.2 * FINE, 20.0, 1.0, True, 2.5e-5),  # only where distances are small
+        (1e-4, 0.2 * FINE, 20.0, 0.8, True, USUAL_DAMPING),  # and if it is what was predicted
+        (1e-4, 0.2 * FINE, 50.0, 1.0, True, USUAL_DAMPING),
+    ]
+    for mu, average, before, gain, good, after in cases:
         state = DampingState(surface, jnp.asarray(1.0), jnp.asarray(mu), jnp.asarray(0))
-        assert np.isclose(
-            next_damping(state, jnp.asarray(1.5), jnp.asarray(fell), jnp.asarray(kept)), after, rtol=1e-6
-        )
+        got = next_damping(state, *(jnp.asarray(x) for x in (before, average, gain, good)))
+        assert np.isclose(got, after, rtol=1e-6)
 
 
 def test_rounding_does_not_decide_on_a_step_that_moves_nothing(base):
@@ -222,7 +232,8 @@ def test_rounding_does_not_decide_on_a_step_that_moves_nothing(base):
     for after in (1.0, np.nextafter(1.0, 0.0), np.nextafter(1.0, 2.0)):
         gain = actual_gain(state, jnp.asarray(1.0), jnp.asarray(after))
         assert bool(is_no_worse(state, gain, jnp.asarray(0.0)))
-        assert np.isclose(next_damping(state, jnp.asarray(1.0), gain, jnp.asarray(True)), 0.1)
+        one = jnp.asarray(1.0)
+        assert np.isclose(next_damping(state, one, one, gain, jnp.asarray(True)), 0.1)
 
 
 @pytest.mark.slow

@@ -18,8 +18,11 @@ POOR, GOOD = 0.25, 0.5
 RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # The damping falls below its usual minimum only after steps that achieve the predicted reduction and remove
 # a good part of the objective. Convergence is then superlinear where all points can be met. Otherwise a lower
-# minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding.
+# minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding. Where the
+# mean distance is below FINE, a share of the diagonal, a smaller part is enough: a net that has to slide
+# along the surface to meet all points gains a few per cent a step until it is damped less.
 EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
+FINE = 2e-4
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 # Steps damped less get a second-order correction. Earlier ones come no closer with it, for each solves
 # another problem than the last one, with less damping and smoothing.
@@ -58,15 +61,20 @@ def is_no_worse(state: DampingState, gain: Array, longest_move: Array) -> Array:
 
 
 def next_damping(
-    state: DampingState, before: Array, gain: Array, good: Array, usual: Any = USUAL_DAMPING
+    state: DampingState, before: Array, average: Any, gain: Array, good: Array, usual: Any = USUAL_DAMPING
 ) -> Array:
-    """The damping of the next step, from the actual reduction `gain` and the predicted one."""
-    superb = (gain > EXCELLENT * state.predicted) & (gain > MUCH * before)
-    least = jnp.where(superb, LEAST_DAMPING, usual)
-    factor = jnp.where(gain > GOOD * state.predicted, LOWERED, 1.0)
-    factor = jnp.where(gain < POOR * state.predicted, RAISED, factor)
-    factor = jnp.where(good, factor, TAKEN_BACK)
-    return jnp.clip(state.damping * factor, least, 1.0).astype(state.damping.dtype)
+    """The damping of the next step, from the actual reduction `gain` and the predicted one. `average` is the
+    mean distance as a share of the diagonal.
+    """
+    damping, predicted = jnp.asarray(state.damping), state.predicted
+    constants = 1.0, LOWERED, RAISED, TAKEN_BACK, LEAST_DAMPING
+    one, lowered, raised, taken_back, least = (np.asarray(x, damping.dtype) for x in constants)
+    much = MUCH * jnp.minimum(average / FINE, 1.0) ** 1.5
+    superb = (gain > EXCELLENT * predicted) & (gain > much * before)
+    factor = lax.select(gain > GOOD * predicted, lowered, one)
+    factor = lax.select(gain < POOR * predicted, raised, factor)
+    factor = lax.select(good, factor, taken_back)
+    return lax.clamp(jnp.where(superb, least, usual), damping * factor, one)
 
 
 def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Array) -> Float[Array, ""]:

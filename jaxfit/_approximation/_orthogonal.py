@@ -251,11 +251,12 @@ class OrthogonalDistance(AbstractIterativeMethod):
             guard = self.smoothing.after(old.state.guard, guard, better, good, new.surface.order, *time)
         # A step that folds is taken again with more smoothing, not with more damping.
         usual = USUAL_DAMPING if guard is None else GUARDED_DAMPING
-        following = next_damping(damped, objective, gain, better, jnp.minimum(usual, self.damping))
-        following = lax.select(better & ~good, damped.damping, following)
-        following = jnp.where((new.step == 1) & good, self.damping, following)
+        least = jnp.minimum(usual, self.damping)
         assert before.summary is not None
         assert here.summary is not None
+        following = next_damping(damped, objective, here.summary[0], gain, better, least)
+        following = lax.select(better & ~good, damped.damping, following)
+        following = jnp.where((new.step == 1) & good, self.damping, following)
         summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])
         before = dataclasses.replace(before, evaluations=here.evaluations, summary=summary)
         surface, projection = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
