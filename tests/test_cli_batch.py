@@ -155,6 +155,7 @@ def test_a_surface_of_an_earlier_run_is_not_written_over_while_its_input_is_ther
         (["a.npz", "-o", "a.npz"], "cannot be made"),
         (["a.npz", "other", "-o", "out"], "other is a folder; name the files in it, as in other/*."),
         (["a.npz", "none/*.npz", "-o", "out"], "none/*.npz matches no file"),
+        (["a.npz", "--net", "3x9"], "net must be at least 4 x 4"),
         (["a.npz", "--workers", "0"], "'0' is no number of processes"),
         (["a.npz", "--workers", "2", "--scheduler", "x"], "not allowed with"),
         (["a.npz", "--scheduler", "tcp://x"], 'pip install "jaxfit-surfaces[cluster]"'),
