@@ -31,6 +31,7 @@ STUDIES = {
     "devices": "a cloud divided among devices, and among processes",
     "closest_point": "closest points: time a point, and how many are wrong",
     "growing_net": "the net chosen for a tolerance, and noise",
+    "large_clouds": "clouds in memory: an iteration, what is outside the loop, memory",
     "streams": "clouds in files, larger than memory",
     "orthogonal": "orthogonal distance: passes, errors, outliers",
     "pictures": "base, default and paper side by side",
