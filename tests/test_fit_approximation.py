@@ -149,7 +149,7 @@ def test_fairing_a_good_base_surface_is_no_stall(base):
     average = np.asarray(fit.history.average)
     assert average[10] > average[0]  # no reason to end there, but that is so from one fairing to others:
     assert average[15] > average[5]
-    assert int(fit.stats["num_steps"]) == 15
+    assert int(fit.stats["num_steps"]) in (15, 16)  # the maximum error may rise an iteration later
 
 
 def test_local_mode_leaves_alone_what_is_near_enough(base):
