@@ -143,13 +143,14 @@ def test_fairing_comes_every_so_many_iterations(base):
 
 @pytest.mark.slow
 def test_fairing_a_good_base_surface_is_no_stall(base):
-    near = jf.approximate(POINTS, base, tol_average=1e-9, max_steps=100).surface
+    nearer = jf.OrthogonalDistance(smoothing=1e-9)
+    near = jf.approximate(POINTS, base, nearer, tol_average=1e-9, max_steps=100).surface
     method = plain(fairing=jf.Fairing(every=5), stall_window=10)
     fit = jf.approximate(POINTS, near, method, tol_average=1e-9, max_steps=200)
     average = np.asarray(fit.history.average)
     assert average[10] > average[0]  # no reason to end there, but that is so from one fairing to others:
     assert average[15] > average[5]
-    assert int(fit.stats["num_steps"]) in (15, 16)  # the maximum error may rise an iteration later
+    assert int(fit.stats["num_steps"]) == 15
 
 
 def test_local_mode_leaves_alone_what_is_near_enough(base):

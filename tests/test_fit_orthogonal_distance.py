@@ -10,8 +10,8 @@ from normal_reference import thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._approximation._damping import (
-    FINE,
     LEAST_DAMPING,
+    SMALL,
     USUAL_DAMPING,
     DampingState,
     actual_gain,
@@ -216,9 +216,9 @@ def test_damping_follows_the_fall_that_was_predicted(base):
         (1e-12, 1.0, 1.5, 1.0, True, LEAST_DAMPING),
         (0.5, 1.0, 1.5, -1.0, False, 1.0),
         (1e-4, 1.0, 20.0, 1.0, True, USUAL_DAMPING),  # a twentieth of the objective is no good part of it
-        (1e-4, 0.2 * FINE, 20.0, 1.0, True, 2.5e-5),  # only where distances are small
-        (1e-4, 0.2 * FINE, 20.0, 0.8, True, USUAL_DAMPING),  # and if it is what was predicted
-        (1e-4, 0.2 * FINE, 50.0, 1.0, True, USUAL_DAMPING),
+        (1e-4, 0.2 * SMALL, 20.0, 1.0, True, 2.5e-5),  # only where distances are small
+        (1e-4, 0.2 * SMALL, 20.0, 0.8, True, USUAL_DAMPING),  # and if it is what was predicted
+        (1e-4, 0.2 * SMALL, 50.0, 1.0, True, USUAL_DAMPING),
     ]
     for mu, average, before, gain, good, after in cases:
         state = DampingState(surface, jnp.asarray(1.0), jnp.asarray(mu), jnp.asarray(0))

@@ -19,10 +19,10 @@ RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # The damping falls below its usual minimum only after steps that achieve the predicted reduction and remove
 # a good part of the objective. Convergence is then superlinear where all points can be met. Otherwise a lower
 # minimum lets the net slide far for little, into folds, and makes the steps sensitive to rounding. Where the
-# mean distance is below FINE, a share of the diagonal, a smaller part is enough: a net that has to slide
+# mean distance is below SMALL, a share of the diagonal, a smaller part is enough: a net that has to slide
 # along the surface to meet all points gains a few per cent a step until it is damped less.
 EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
-FINE = 2e-4
+SMALL = 2e-4
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 # Steps damped less get a second-order correction. Earlier ones come no closer with it, for each solves
 # another problem than the last one, with less damping and smoothing.
@@ -69,7 +69,7 @@ def next_damping(
     damping, predicted = jnp.asarray(state.damping), state.predicted
     constants = 1.0, LOWERED, RAISED, TAKEN_BACK, LEAST_DAMPING
     one, lowered, raised, taken_back, least = (np.asarray(x, damping.dtype) for x in constants)
-    much = MUCH * jnp.minimum(average / FINE, 1.0) ** 1.5
+    much = MUCH * jnp.minimum(average / SMALL, 1.0) ** 1.5
     superb = (gain > EXCELLENT * predicted) & (gain > much * before)
     factor = lax.select(gain > GOOD * predicted, lowered, one)
     factor = lax.select(gain < POOR * predicted, raised, factor)
