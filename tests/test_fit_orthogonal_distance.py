@@ -219,6 +219,9 @@ def test_damping_follows_the_fall_that_was_predicted(base):
         (1e-4, 0.2 * SMALL, 20.0, 1.0, True, 2.5e-5),  # only where distances are small
         (1e-4, 0.2 * SMALL, 20.0, 0.8, True, USUAL_DAMPING),  # and if it is what was predicted
         (1e-4, 0.2 * SMALL, 50.0, 1.0, True, USUAL_DAMPING),
+        (1e-4, 1.0, 1e6, 1.98, True, 2.5e-5),  # a step that the damping alone keeps short
+        (1e-7, 1.0, 20.0, 1.0, True, 1e-6),  # up to the usual minimum step by step
+        (1e-7, 1.0, 20.0, -1.0, False, 1e-6),
     ]
     for mu, average, before, gain, good, after in cases:
         state = DampingState(surface, jnp.asarray(1.0), jnp.asarray(mu), jnp.asarray(0))

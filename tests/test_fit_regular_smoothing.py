@@ -116,6 +116,30 @@ def test_a_spline_surface_is_found_again(smooth, seed):
     assert fit.folds == 0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [jf.Coons(), jf.Meshless()])
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_a_spline_surface_is_found_again_from_its_sides(noise, method):
+    """Of nets with a free border, too, which slide a long way for hardly any gain."""
+    got = data("bspline_reference")
+    knots = [got[x] / got[x][-1] for x in ("knots_u", "knots_v")]
+    points, size = got["points"], diagonal(got["points"])
+    true, t = jf.BSplineSurface(got["control_points"], *knots), np.linspace(0, 1, 200)
+    sides = [np.array(true(*uv)) for uv in ((t, 0 * t), (t, 0 * t + 1), (0 * t, t), (0 * t + 1, t))]
+    rng = np.random.default_rng(0)
+    for side in sides:
+        side[1:-1] += noise * size * rng.normal(size=(198, 3))
+    base = jf.base_surface(jf.Boundary(*sides), points, net=(6, 6), method=method)
+    base = jf.BSplineSurface(base.control_points, *knots)
+    free = jf.OrthogonalDistance(border=jf.FreeBorder())
+    fit = jf.approximate(points, base, free, tol_average=1e-13, max_steps=300)
+    away = jf.closest_point(fit.surface, got["grid40"].reshape(-1, 3)).distance
+    assert fit.converged
+    assert float(jnp.max(away)) < 1e-7 * size
+    assert float(jnp.mean(away)) < 1e-9 * size
+    assert fit.folds == 0
+
+
 @pytest.mark.parametrize("order", [(4, 4), (3, 5), (2, 4)])
 def test_roughness_is_its_matrix_and_ignores_even_nets(order):
     rng = np.random.default_rng(0)

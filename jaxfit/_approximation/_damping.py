@@ -23,6 +23,9 @@ RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 # along the surface to meet all points gains a few per cent a step until it is damped less.
 EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
 SMALL = 2e-4
+# The predicted reduction is that of the damped problem. The actual one comes to twice as much where nothing
+# but the damping keeps the step short. No part of the objective is too small for less damping then.
+LIMITED = 1.95
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 # Steps damped less get a second-order correction. Earlier ones come no closer with it, for each solves
 # another problem than the last one, with less damping and smoothing.
@@ -69,12 +72,14 @@ def next_damping(
     damping, predicted = jnp.asarray(state.damping), state.predicted
     constants = 1.0, LOWERED, RAISED, TAKEN_BACK, LEAST_DAMPING
     one, lowered, raised, taken_back, least = (np.asarray(x, damping.dtype) for x in constants)
-    much = MUCH * jnp.minimum(average / SMALL, 1.0) ** 1.5
-    superb = (gain > EXCELLENT * predicted) & (gain > much * before)
+    much = MUCH * jnp.minimum(average / SMALL, 1.0) ** 1.5 * before
+    superb = gain > jnp.minimum(jnp.maximum(EXCELLENT * predicted, much), LIMITED * predicted)
     factor = lax.select(gain > GOOD * predicted, lowered, one)
     factor = lax.select(gain < POOR * predicted, raised, factor)
     factor = lax.select(good, factor, taken_back)
-    return lax.clamp(jnp.where(superb, least, usual), damping * factor, one)
+    # Where the damping has been below its usual minimum it rises step by step, too.
+    usual = jnp.minimum(usual, taken_back * damping)
+    return lax.clamp(lax.select(superb, least, usual), damping * factor, one)
 
 
 def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Array) -> Float[Array, ""]:

@@ -256,7 +256,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         assert here.summary is not None
         following = next_damping(damped, objective, here.summary[0], gain, better, least)
         following = lax.select(better & ~good, damped.damping, following)
-        following = jnp.where((new.step == 1) & good, self.damping, following)
+        following = lax.select((new.step == 1) & good, jnp.asarray(self.damping, following.dtype), following)
         summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])
         before = dataclasses.replace(before, evaluations=here.evaluations, summary=summary)
         surface, projection = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
