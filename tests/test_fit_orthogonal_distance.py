@@ -219,13 +219,26 @@ def test_damping_follows_the_fall_that_was_predicted(base):
         (1e-4, 0.2 * SMALL, 20.0, 1.0, True, 2.5e-5),  # only where distances are small
         (1e-4, 0.2 * SMALL, 20.0, 0.8, True, USUAL_DAMPING),  # and if it is what was predicted
         (1e-4, 0.2 * SMALL, 50.0, 1.0, True, USUAL_DAMPING),
-        (1e-4, 1.0, 1e6, 1.98, True, 2.5e-5),  # a step that the damping alone keeps short
-        (1e-7, 1.0, 20.0, 1.0, True, 1e-6),  # up to the usual minimum step by step
-        (1e-7, 1.0, 20.0, -1.0, False, 1e-6),
     ]
     for mu, average, before, gain, good, after in cases:
         state = DampingState(surface, jnp.asarray(1.0), jnp.asarray(mu), jnp.asarray(0))
         got = next_damping(state, *(jnp.asarray(x) for x in (before, average, gain, good)))
+        assert np.isclose(got, after, rtol=1e-6)
+
+
+def test_steps_that_the_damping_alone_keeps_short_lower_it_where_the_border_is_free(base):
+    surface = WorkingSurface.of(base.control_points, base.knots_u, base.knots_v)
+    one, accepted = jnp.asarray(1.0), jnp.asarray(True)
+    cases = [  # predicted, actual, whether the border is free, next damping
+        (1.0, 1.98, True, 2.5e-5),
+        (1.0, 1.9, True, USUAL_DAMPING),
+        (1.0, 1.98, False, USUAL_DAMPING),
+        (-1.0, 0.1, True, USUAL_DAMPING),
+        (0.0, 0.0, True, USUAL_DAMPING),
+    ]
+    for predicted, gain, is_free, after in cases:
+        state = DampingState(surface, jnp.asarray(predicted), jnp.asarray(1e-4), jnp.asarray(0))
+        got = next_damping(state, 1e6 * one, one, jnp.asarray(gain), accepted, border_is_free=is_free)
         assert np.isclose(got, after, rtol=1e-6)
 
 

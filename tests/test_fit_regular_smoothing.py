@@ -132,12 +132,30 @@ def test_a_spline_surface_is_found_again_from_its_sides(noise, method):
     base = jf.base_surface(jf.Boundary(*sides), points, net=(6, 6), method=method)
     base = jf.BSplineSurface(base.control_points, *knots)
     free = jf.OrthogonalDistance(border=jf.FreeBorder())
-    fit = jf.approximate(points, base, free, tol_average=1e-13, max_steps=300)
+    fit = jf.approximate(points, base, free, tol_average=1e-13, max_steps=500)
     away = jf.closest_point(fit.surface, got["grid40"].reshape(-1, 3)).distance
     assert fit.converged
     assert float(jnp.max(away)) < 1e-7 * size
     assert float(jnp.mean(away)) < 1e-9 * size
     assert fit.folds == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("border", [jf.FixedBorder(), jf.FreeBorder()])
+def test_a_tolerance_out_of_reach_folds_no_cylinder(border):
+    """Of three quarters of a turn, which no net of splines meets."""
+
+    def cylinder(u, v):
+        return np.stack([np.cos(1.5 * np.pi * u), 2 * v, np.sin(1.5 * np.pi * u)], axis=-1)
+
+    t = np.linspace(0, 1, 81)
+    sides = [cylinder(*uv) for uv in ((t, 0 * t), (t, 0 * t + 1), (0 * t, t), (0 * t + 1, t))]
+    base = jf.base_surface(jf.Boundary(*sides), net=(14, 14))
+    points = cylinder(*np.random.default_rng(7).uniform(size=(2, 4000)))
+    fit = jf.approximate(points, base, jf.OrthogonalDistance(border=border), tol_average=1e-10, max_steps=150)
+    assert not fit.converged
+    assert fit.folds == 0
+    assert float(fit.average_error) < 5e-5
 
 
 @pytest.mark.parametrize("order", [(4, 4), (3, 5), (2, 4)])

@@ -24,7 +24,8 @@ RAISED, LOWERED, TAKEN_BACK = 4.0, 0.25, 10.0  # factors of the damping
 EXCELLENT, MUCH, LEAST_DAMPING = 0.9, 0.3, 1e-12
 SMALL = 2e-4
 # The predicted reduction is that of the damped problem. The actual one comes to twice as much where nothing
-# but the damping keeps the step short. No part of the objective is too small for less damping then.
+# but the damping keeps the step short. A net with a free border is damped less then, however little such a
+# step removes: it has a long way to slide. One whose border is held would slide into folds beside it.
 LIMITED = 1.95
 USUAL_DAMPING, GUARDED_DAMPING = 1e-4, 1e-3  # the latter where folds are kept out
 # Steps damped less get a second-order correction. Earlier ones come no closer with it, for each solves
@@ -64,7 +65,13 @@ def is_no_worse(state: DampingState, gain: Array, longest_move: Array) -> Array:
 
 
 def next_damping(
-    state: DampingState, before: Array, average: Any, gain: Array, good: Array, usual: Any = USUAL_DAMPING
+    state: DampingState,
+    before: Array,
+    average: Any,
+    gain: Array,
+    good: Array,
+    usual: Any = USUAL_DAMPING,
+    border_is_free: bool = False,
 ) -> Array:
     """The damping of the next step, from the actual reduction `gain` and the predicted one. `average` is the
     mean distance as a share of the diagonal.
@@ -72,14 +79,14 @@ def next_damping(
     damping, predicted = jnp.asarray(state.damping), state.predicted
     constants = 1.0, LOWERED, RAISED, TAKEN_BACK, LEAST_DAMPING
     one, lowered, raised, taken_back, least = (np.asarray(x, damping.dtype) for x in constants)
-    much = MUCH * jnp.minimum(average / SMALL, 1.0) ** 1.5 * before
-    superb = gain > jnp.minimum(jnp.maximum(EXCELLENT * predicted, much), LIMITED * predicted)
+    much = MUCH * jnp.minimum(average / SMALL, 1.0) ** 1.5
+    superb = (gain > EXCELLENT * predicted) & (gain > much * before)
+    if border_is_free:  # the predicted reduction may be negative where moves were shortened
+        superb |= (gain > LIMITED * predicted) & (predicted > 0)
     factor = lax.select(gain > GOOD * predicted, lowered, one)
     factor = lax.select(gain < POOR * predicted, raised, factor)
     factor = lax.select(good, factor, taken_back)
-    # Where the damping has been below its usual minimum it rises step by step, too.
-    usual = jnp.minimum(usual, taken_back * damping)
-    return lax.clamp(lax.select(superb, least, usual), damping * factor, one)
+    return lax.clamp(jnp.where(superb, least, usual), damping * factor, one)
 
 
 def farthest_move(axes: tuple[Axis, Axis], before: Any, after: Any, counts: Array) -> Float[Array, ""]:

@@ -38,7 +38,7 @@ from jaxfit._approximation._smoothing_term import (
 from jaxfit._barrier import materialise
 from jaxfit._checks import Scalar, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
-from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
+from jaxfit._fit._border import AbstractBorder, FixedBorder, FreeBorder, check_border, held_points
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
@@ -254,9 +254,10 @@ class OrthogonalDistance(AbstractIterativeMethod):
         least = jnp.minimum(usual, self.damping)
         assert before.summary is not None
         assert here.summary is not None
-        following = next_damping(damped, objective, here.summary[0], gain, better, least)
+        is_free = isinstance(self.border, FreeBorder)
+        following = next_damping(damped, objective, here.summary[0], gain, better, least, is_free)
         following = lax.select(better & ~good, damped.damping, following)
-        following = lax.select((new.step == 1) & good, jnp.asarray(self.damping, following.dtype), following)
+        following = jnp.where((new.step == 1) & good, self.damping, following)
         summary = jnp.concatenate([before.summary[:2], here.summary[2:3], np.zeros(1, here.u.dtype)])
         before = dataclasses.replace(before, evaluations=here.evaluations, summary=summary)
         surface, projection = lax.cond(good, lambda: (new.surface, here), lambda: (damped.origin, before))
