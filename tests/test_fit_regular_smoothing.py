@@ -120,7 +120,7 @@ def test_a_spline_surface_is_found_again(smooth, seed):
 @pytest.mark.parametrize("method", [jf.Coons(), jf.Meshless()])
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_a_spline_surface_is_found_again_from_its_sides(noise, method):
-    """Of nets with a free border, too, which slide a long way for hardly any gain."""
+    """A net with a free border slides a long way along the surface, and each step gains little."""
     got = data("bspline_reference")
     knots = [got[x] / got[x][-1] for x in ("knots_u", "knots_v")]
     points, size = got["points"], diagonal(got["points"])

@@ -128,7 +128,7 @@ def fit_points(
     -----
     Knots are placed by how the sides bend. For knots of your own give them to a base surface with as many
     control points, `BSplineSurface(base.control_points, knots_u, knots_v)`, and call `approximate` with a
-    `FreeBorder`, for the sides are moved by other knots.
+    method whose border is `FreeBorder()`: with other knots the sides are no longer those of the boundary.
 
     Without a `net` a coarse one is fitted to nine in ten of the points, fine enough for the sides to come
     within 0.5 % of the diagonal. It is made up to 1.44 times finer each way, again and again, each fit
