@@ -34,6 +34,11 @@ def test_the_call_takes_what_was_compiled_ahead():
     assert found.count > 0
 
 
+def test_xla_knows_our_options():
+    program = jax.jit(made_of, compiler_options=_compile.FOR_CPUS).lower(X, 1.0).compile()  # or it raises
+    assert float(program(X, 3.0)) == pytest.approx(3.0 * np.sin(X) @ np.cos(X))
+
+
 def test_what_goes_wrong_in_the_thread_is_raised_by_the_call():
     impossible = jax.jit(made_of, compiler_options={"xla_of_another_world": True})
     compile_ahead(impossible, 0, (X, 1.0))

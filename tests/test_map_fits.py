@@ -125,6 +125,21 @@ def test_any_executor_computes():
     assert_same(fits, jf.map_fits(CLOUDS, BASE, **OPTIONS))
 
 
+def test_workers_get_fewer_and_fewer_fits_at_once():
+    class Noting(ThreadPoolExecutor):
+        def submit(self, function, /, *args, **kwargs):
+            sizes.extend(len(x) for x in args[:1])
+            return super().submit(function, *args, **kwargs)
+
+    sizes = []
+    with Noting(2) as executor:
+        jf.map_fits([CLOUDS[0]] * 40, BASE, jf.StandardApproximation(), executor=executor, max_steps=0)
+    assert sum(sizes) == 40
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[0] > 1
+    assert sizes[-4:] == [1, 1, 1, 1]
+
+
 @pytest.mark.parametrize("method", slow_except(METHODS, *METHODS[:2]), ids=name)
 def test_padding_has_no_influence(method):
     def fitted(cloud, weights):

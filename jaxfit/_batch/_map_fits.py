@@ -21,7 +21,8 @@ from jaxfit._precision import bucket, working_dtype
 from jaxfit._progress_line import doing, shows_progress
 from jaxfit._splines import BSplineSurface
 
-_LARGEST_GROUP = 16  # fits that go to a worker at once
+# Fits that go to a worker at once: at most so many, and so small a share of those left that all end together.
+_LARGEST_GROUP, _SHARE = 16, 16
 
 
 @shows_progress("fitting clouds")
@@ -116,8 +117,7 @@ def _fit_group(requests: list[Request], options: dict[str, Any]) -> list[Fit]:
 def _run(requests: list[Request], executor: Executor | None, options: dict[str, Any]) -> list[Fit]:
     if executor is not None:
         _check_precision(executor)
-        size = min(_LARGEST_GROUP, max(1, len(requests) // _LARGEST_GROUP))
-        return _in_groups(requests, executor, options, size)
+        return _in_groups(requests, executor, options, _LARGEST_GROUP)
     threads = cores() if jax.default_backend() == "cpu" else 1
     # The first fit of each size alone: threads that come upon a new program each compile it.
     sizes = [(bucket(len(x.cloud)), x.base.shape, type(x.method)) for x in requests]
@@ -130,9 +130,12 @@ def _run(requests: list[Request], executor: Executor | None, options: dict[str, 
     return [next(first if leads else rest) for leads in leading]
 
 
-def _in_groups(requests: list[Request], executor: Executor, options: dict[str, Any], size: int) -> list[Fit]:
-    groups = [requests[i : i + size] for i in range(0, len(requests), size)]
-    futures = [executor.submit(_fit_group, group, options) for group in groups]
+def _in_groups(requests: list[Request], executor: Executor, options: dict[str, Any], most: int) -> list[Fit]:
+    futures, left = [], requests
+    while left:
+        size = min(most, -(-len(left) // _SHARE))
+        futures.append(executor.submit(_fit_group, left[:size], options))
+        left = left[size:]
     fits: list[Fit] = []
     try:
         for future in futures:

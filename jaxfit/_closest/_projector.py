@@ -12,7 +12,10 @@ from jaxfit._closest._chunks import HostFeet, in_chunks, neighbours_together, pa
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
 from jaxfit._compile import compiled
+from jaxfit._remembered import remembered
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
+
+LAST_SURFACES = 2  # of which what has been made is remembered
 
 
 @partial(compiled, kept=True, static_argnums=(0, 1))
@@ -37,6 +40,11 @@ def _run(
         "steps": feet.steps,
         "point": values_at(pieces, feet.best_u, feet.best_v),
     }
+
+
+@remembered(LAST_SURFACES)
+def _remembered_pieces(net: np.ndarray, axis_u: Axis, axis_v: Axis) -> Pieces:
+    return jax.device_put(pieces_on(net, axis_u, axis_v))
 
 
 class Projector:
@@ -72,7 +80,7 @@ class Projector:
     @cached_property
     def pieces(self) -> Pieces:
         """The surface, made only if there is anything to project."""
-        return jax.device_put(pieces_on(self.net.astype(self.dtype), *self.axes))
+        return _remembered_pieces(self.net.astype(self.dtype), *self.axes)
 
     def compile_ahead(self) -> None:
         """Begin to compile the program that the calls take, if that has not been done."""

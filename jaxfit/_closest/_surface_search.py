@@ -8,7 +8,7 @@ from jaxtyping import Int
 
 from jaxfit._closest._candidates import Search
 from jaxfit._closest._chunks import HostFeet, neighbours_together
-from jaxfit._closest._projector import Projector
+from jaxfit._closest._projector import LAST_SURFACES, Projector
 from jaxfit._closest._reach import POINTS_PER_SAMPLE, Reach, number_of_samples
 from jaxfit._closest._samples import sample
 from jaxfit._remembered import remembered
@@ -18,7 +18,6 @@ MOST_POINTS, MOST_STARTS = 1 << 14, 1 << 16  # tried in one go, for the memory's
 # Where cells are few the reach costs little, and it spares searches that exchange feet for the same ones with
 # other last digits.
 LEAST_POINTS_PER_CELL = 24
-LAST_SURFACES = 2  # whose samples are remembered
 
 
 class SurfaceSearch:
