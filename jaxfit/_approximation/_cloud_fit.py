@@ -96,7 +96,7 @@ def fit_cloud(
         stats = stats | {"stationarity": share}
     parts = _at_feet(request["errors"], surface, cloud, known, method.finds_feet, concrete, room)
     stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
-    fit = _fit(loop, problem, cloud, parts, unit, surface, stats, getattr(method, "fairing", None))
+    fit = _fit(loop, problem, cloud, parts, unit, surface, stats, getattr(method, "fairing", None), concrete)
     return converged_or_raise(fit) if request["throw"] else fit
 
 
@@ -290,10 +290,10 @@ def _fit(
     surface: BSplineSurface,
     stats: dict[str, Any],
     fairing: Any,
+    concrete: bool,
 ) -> Fit:
     """The result. Averages and maxima are over the points of positive weight. Outside transformations errors
     include a bound on the rounding of the control points."""
-    concrete = is_concrete(loop, parts, unit)
     xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
     u, v, distance, _ = (xp.asarray(x) for x in parts)
     relative = distance / unit.diagonal
