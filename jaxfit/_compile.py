@@ -20,7 +20,7 @@ LEVEL = {"xla_backend_optimization_level": 1}
 PARTS = {"xla_cpu_parallel_codegen_split_count": 8}
 # Where vectors are that wide, kernels take 4 to 8 % less time than with the 256 bits that LLVM prefers.
 VECTORS = {"xla_cpu_prefer_vector_width": 512}
-# Fewer arrays are copied in loops: 1 to 3 %.
+# Fewer arrays are copied in loops, which saves another 1 to 3 %.
 COPIES = {"xla_cpu_copy_insertion_use_region_analysis": True}
 FOR_CPUS = OLDER_EMITTER | LEVEL | PARTS | VECTORS | COPIES
 UNKNOWN = "No such compile option"

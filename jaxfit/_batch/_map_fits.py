@@ -21,8 +21,9 @@ from jaxfit._precision import bucket, working_dtype
 from jaxfit._progress_line import doing, shows_progress
 from jaxfit._splines import BSplineSurface
 
-# Fits that go to a worker at once: at most so many, and so small a share of those left that all end together.
-_LARGEST_GROUP, _SHARE = 16, 16
+# A worker gets so many fits at a time, or one in so many of those left: towards the end one by one, so that
+# no worker waits long for the others.
+_LARGEST_GROUP, _ONE_IN = 16, 16
 
 
 @shows_progress("fitting clouds")
@@ -133,7 +134,7 @@ def _run(requests: list[Request], executor: Executor | None, options: dict[str, 
 def _in_groups(requests: list[Request], executor: Executor, options: dict[str, Any], most: int) -> list[Fit]:
     futures, left = [], requests
     while left:
-        size = min(most, -(-len(left) // _SHARE))
+        size = min(most, -(-len(left) // _ONE_IN))
         futures.append(executor.submit(_fit_group, left[:size], options))
         left = left[size:]
     fits: list[Fit] = []

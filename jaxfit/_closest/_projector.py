@@ -12,11 +12,10 @@ from jaxfit._closest._chunks import HostFeet, in_chunks, neighbours_together, pa
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._project import project
 from jaxfit._compile import compiled
-from jaxfit._compile_ahead import is_first
 from jaxfit._remembered import remembered
 from jaxfit._splines._pieces import Axis, Pieces, pieces_on
 
-LAST_SURFACES = 2  # of which what has been made is remembered
+LAST_SURFACES = 2  # whose polynomial pieces and samples are remembered
 
 
 @partial(compiled, kept=True, static_argnums=(0, 1))
@@ -85,9 +84,6 @@ class Projector:
 
     def compile_ahead(self) -> None:
         """Begin to compile the program that the calls take, if that has not been done."""
-        axes = tuple((axis.breaks.size, axis.creased) for axis in self.axes)
-        if not is_first(_run, self.method, self.net.shape, axes, self.size, self.dtype):
-            return
         nothing = np.zeros((self.net.shape[2], self.size), self.dtype)
         idle = np.zeros(self.size, bool)
         _run.ahead(self.method, False, self.pieces, nothing, nothing[0], nothing[0], idle, *self.limits)

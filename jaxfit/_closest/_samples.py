@@ -68,7 +68,7 @@ def _parameters(axis_u: Axis, axis_v: Axis) -> tuple[Any, Any, int, int]:
 
 
 def _along(axis: Axis, count: int) -> Float[Numbers, " a"]:
-    concrete = is_concrete(axis.breaks)
+    concrete = is_concrete(axis)
     xp: Any = np if concrete else jnp
     share = np.arange(count, dtype=axis.breaks.dtype) / count
     low, width = axis.breaks[:-1, None], (axis.breaks[1:] - axis.breaks[:-1])[:, None]
@@ -86,7 +86,7 @@ def grid_jet(
 
     One direction after the other: a small matrix of basis functions for each sample.
     """
-    xp: Any = np if is_concrete(net, axes[0].breaks, axes[1].breaks, *parameters) else jnp
+    xp: Any = np if is_concrete(net, *axes, *parameters) else jnp
     matmul: Any = np.matmul if xp is np else partial(jnp.matmul, precision="highest")
     nu, nv, d = net.shape
     (weights_u, at_u), (weights_v, at_v) = (
@@ -101,7 +101,7 @@ def grid_jet(
 
 def _basis(axis: Axis, x: Any, cell: Any, order: int, dtype: Any) -> tuple[Any, Any]:
     """Basis functions and derivatives, (samples, order + 1, K), and the control points they belong to."""
-    xp: Any = np if is_concrete(axis.breaks, x) else jnp
+    xp: Any = np if is_concrete(axis, x) else jnp
     local = ((x - axis.centre[cell]) / axis.half[cell])[:, None, None]
     width = axis.polynomials.shape[1]
     power = np.arange(width) - np.arange(order + 1)[:, None]

@@ -82,7 +82,7 @@ class Axis(eqx.Module):
 
     def locate(self, u: Any) -> Any:
         """Span with breaks[i] <= u < breaks[i+1]; the last non-empty one at the right end."""
-        if is_concrete(self.breaks, self.ends, u):
+        if is_concrete(self, u):
             number = np.searchsorted(np.asarray(self.breaks), np.asarray(u), side="right") - 1
             return np.clip(number, *np.asarray(self.ends)).astype(np.int32)
         ends = np.asarray(self.ends) if is_concrete(self.ends) else self.ends
