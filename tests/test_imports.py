@@ -18,6 +18,7 @@ ROOMS = [
     ("_kept_programs",),
     ("_compile_ahead",),
     ("_unrolling", "_barrier", "_compile", "_program_folder"),
+    ("_linear_program",),
     ("_splines",),
     ("_parameters",),
     ("_cells",),

@@ -26,7 +26,7 @@ from jaxfit._checks import as_points, check_kind, is_concrete, without_derivativ
 from jaxfit._closest import closest_point, neighbours_together
 from jaxfit._fit._adjoints import ImplicitAdjoint, UnrolledAdjoint
 from jaxfit._fit._history import public_history
-from jaxfit._fit._loop import LoopState, begin, run
+from jaxfit._fit._loop import LoopState, begin, check_derivative, run
 from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields, static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
@@ -56,20 +56,20 @@ def fit_cloud(
     cloud = as_points("points", points, base.dimension, least=LEAST_POINTS)
     dtype = working_dtype()
     given = (cloud if is_concrete(cloud) else cloud.astype(dtype), base, method, request)
-    cloud, base, method, request = without_derivatives(given)
+    cloud, base, method, request = values = without_derivatives(given)
     unit, weight, feet = checked_request(cloud, base.domain, method=method, **request)
     goals, max_steps = (request["tol_average"], request["tol_maximum"]), request["max_steps"]
-    for tolerance in goals:
-        if tolerance is not None and is_concrete(tolerance):
-            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
+    _advise_precision(goals, base)
     concrete = is_concrete(cloud, base, weight, request["start"], goals, method)
     tolerances = tolerances_of(*goals, max_steps)
     problem = make_problem(cloud, weight, unit, tolerances, padded=concrete)
     begun = working_surface(base, unit, concrete)
     if room is not None:
         begun = begun.padded(room.net[0] - base.shape[0], room.net[1] - base.shape[1])
-    if concrete and is_concrete(given):  # or else the method may have no derivative
-        programs_ahead(method, problem, begun, cloud.shape[0], request, room)
+    unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
+    implicit = not unrolled and (request["adjoint"] is not None or not is_concrete(given))
+    if concrete:
+        programs_ahead(method, problem, begun, cloud.shape[0], request, room, implicit)
     u, v = (_padded(x, problem.weight.shape[0], dtype) for x in feet or _nearest(base, cloud, method, room))
     sorts = method.finds_feet or getattr(method, "loss", None) is not None  # whose scale looks at neighbours
     order = order_by_cell(begun, u, v, cloud.shape[0], sorts)
@@ -79,9 +79,8 @@ def fit_cloud(
     _announce(base.shape, cloud.shape[0], room)
     loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
     first = _end(together, begun, loop, order, unit, begun)
-    unrolled = isinstance(request["adjoint"], UnrolledAdjoint)
-    if not unrolled and (request["adjoint"] is not None or (concrete and not is_concrete(given))):
-        _prepare_derivative((cloud, base, method, request), first, concrete, not is_concrete(given))
+    if implicit:
+        _prepare_derivative(values, together, loop, first, not is_concrete(given))
     if unrolled:
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
         cloud, base, method, concrete = *given[:3], is_concrete(given)
@@ -89,7 +88,7 @@ def fit_cloud(
         loop, stats = run(method, together, loop, request["progress"] if concrete else None)
     surface = fitted_surface(loop.current.surface, base, begun, unit)
     known = _in_given_order(loop, order, cloud.shape[0], unit, concrete)
-    if not unrolled and (request["adjoint"] is not None or not is_concrete(given)):
+    if implicit:
         end = _end(together, loop.current.surface, loop, order, unit, begun)
         surface, known, unit, share = _differentiable(given, end, surface, known)
         cloud, concrete = given[0], is_concrete(given)
@@ -98,6 +97,12 @@ def fit_cloud(
     stats = stats_of(method, tolerances, loop.current.step, unit, _sum(~parts[3])) | stats
     fit = _fit(loop, problem, cloud, parts, unit, surface, stats, getattr(method, "fairing", None), concrete)
     return converged_or_raise(fit) if request["throw"] else fit
+
+
+def _advise_precision(goals: tuple[Any, Any], base: BSplineSurface) -> None:
+    for tolerance in goals:
+        if tolerance is not None and is_concrete(tolerance):
+            advise_x64(float(np.asarray(tolerance)), np.dtype(base.control_points.dtype))
 
 
 def _announce(net: tuple[int, int], count: int, room: Room | None) -> None:
@@ -118,12 +123,16 @@ def _nearest(
     return nearest.u, nearest.v
 
 
-def _prepare_derivative(values: Any, first: EndOfFit, concrete: bool, differentiated: bool) -> None:
+def _prepare_derivative(
+    values: Any, problem: Problem, loop: LoopState, first: EndOfFit, differentiated: bool
+) -> None:
     """Have a method that has no implicit derivative say so before the fit, which may take long, and begin to
     compile what brings the fit to rest; `first` is where it begins.
     """
     _, _, method, request = values
-    jax.eval_shape(method.stationarity, first.problem, first.surface, first.state, first.projection.error)
+    concrete = is_concrete(values, problem, loop)
+    if concrete or request["adjoint"] is not None:
+        check_derivative(method, problem, loop)
     if concrete:
         adjoint = request["adjoint"] or ImplicitAdjoint()
         polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values), differentiated)
@@ -148,13 +157,14 @@ def _differentiable(
     inputs, (_, rest) = FitInputs.of(*given), dynamic_fields(method)
     adjoint = request["adjoint"]
     if adjoint is None:
-        net = jnp.asarray(end.unit.outward(jnp.asarray(end.surface.control_points, dtype)), dtype)
-        nu, nv = surface.shape
-        net = net.at[:nu, :nv].set(surface.control_points.astype(dtype))  # to the last bit
-        unknown = jnp.asarray(jnp.nan, dtype)
-        u, v, error = (jnp.asarray(x) for x in known[:3])
-        diagonal = jnp.asarray(end.unit.diagonal, dtype)
-        fitted = Fitted(net, u, v, error, diagonal, unknown)
+        xp: Any = np if is_concrete(end, surface, known) else jnp  # NumPy compiles nothing
+        net = xp.asarray(end.unit.outward(end.surface.control_points), dtype)
+        same = xp.asarray(surface.control_points, dtype)  # to the last bit
+        if same.shape != net.shape:
+            room = [(0, a - b) for a, b in zip(net.shape, same.shape, strict=True)]
+            same = xp.where(np.pad(np.ones(same.shape, bool), room), xp.pad(same, room), net)
+        diagonal = xp.asarray(end.unit.diagonal, dtype)
+        fitted = Fitted(same, *known[:3], diagonal, np.asarray(np.nan, dtype))
         fitted = with_implicit_derivative(rest, ImplicitAdjoint(), fitted, end, inputs)
     else:
         fitted = polished_fitted(rest, adjoint, end, inputs)
@@ -294,16 +304,14 @@ def _fit(
 ) -> Fit:
     """The result. Averages and maxima are over the points of positive weight. Outside transformations errors
     include a bound on the rounding of the control points."""
-    xp: Any = np if concrete else jnp  # NumPy compiles nothing for a new size
-    u, v, distance, _ = (xp.asarray(x) for x in parts)
-    relative = distance / unit.diagonal
+    xp: Any = np if concrete else jnp
+    u, v, distance = (xp.asarray(x) for x in parts[:3])
     loss = unit.loss(np.asarray(surface.control_points)) if concrete else None
-    relative = relative if loss is None else relative + loss
-    counted = xp.asarray(problem.weight)[: relative.shape[0]] > 0
-    average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
-    maximum = xp.where(xp.isnan(average), average, xp.max(xp.where(counted, relative, 0.0)))
+    found = _relative if concrete else jax.jit(_relative)
+    relative, average, maximum = found(distance, unit.diagonal, problem.weight, loss)
     arrays: Any = (u, v, relative, average, maximum)
     if concrete:
+        counted = np.asarray(problem.weight)[: len(distance)] > 0
         stats = stats | _at_border(surface, cloud, (u, v), relative, counted)
         arrays = jax.device_put([np.asarray(x, problem.target.dtype) for x in arrays])
     return Fit(
@@ -319,6 +327,16 @@ def _fit(
         ),
         stats=stats,
     )
+
+
+def _relative(distance: Any, diagonal: Any, weight: Any, loss: Any) -> tuple[Any, Any, Any]:
+    """The errors of all points, their average and their maximum, as fractions of the diagonal."""
+    xp: Any = np if is_concrete(distance, diagonal, weight) else jnp  # NumPy compiles nothing for a new size
+    relative = distance / diagonal if loss is None else distance / diagonal + loss
+    counted = xp.asarray(weight)[: relative.shape[0]] > 0
+    average = xp.sum(xp.where(counted, relative, 0.0)) / xp.sum(counted)
+    maximum = xp.where(xp.isnan(average), average, xp.max(xp.where(counted, relative, 0.0)))
+    return relative, average, maximum
 
 
 def _at_border(surface: BSplineSurface, cloud: Any, feet: Any, errors: Any, counted: Any) -> dict[str, Any]:

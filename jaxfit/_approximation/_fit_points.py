@@ -217,8 +217,10 @@ def fit_points(
     else:
         net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
         check_net_of_cloud(net, cloud.shape[0])
-        if is_concrete(cloud, method, options):  # or else the method may have no derivative
-            programs_of_cloud_ahead(default_method(method), fixed, net, order, _DEFAULTS | known)
+        values, implicit = without_derivatives(method), not is_concrete(cloud, method, options)
+        if is_concrete(values, known):
+            request = _DEFAULTS | known
+            programs_of_cloud_ahead(default_method(values), fixed, net, order, request, None, implicit)
         begun = _base(boundary, fixed, net, order, base)
         fit = approximate(cloud, begun, method, **(options | {"throw": False}))
     if is_concrete(known):

@@ -24,6 +24,7 @@ from jaxfit._approximation._stationarity_residual import (
     feet_in_rows,
     stationarity_residual,
 )
+from jaxfit._cells import Rows
 from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
@@ -34,6 +35,7 @@ from jaxfit._fit._problem import Problem
 from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface
+from jaxfit._linear_program import linear_call, transpose_ahead
 from jaxfit._precision import default_foot_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._insertion import insertion_weights
@@ -165,7 +167,10 @@ def polish_ahead(
     args = (rest, *_limits(adjoint, end), end, inputs)
     polished_fit.ahead(*args)
     if differentiated_too:
-        _linearised.ahead(rest, polished_fit.like_result(*args), end, inputs)
+        at_rest = polished_fit.like_result(*args)
+        _linearised.ahead(rest, at_rest, end, inputs)
+        fitted, maps = _linearised.like_result(rest, at_rest, end, inputs)
+        transpose_ahead(_along, (maps, at_rest.system), inputs, fitted)
 
 
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
@@ -202,7 +207,7 @@ def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitI
 def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
     fitted, maps = _linearised(rest, at_rest, end, differentiated(inputs))
-    return fitted, _along(maps, at_rest.system, _with_zeros(tangents[2]))
+    return fitted, linear_call(_along, (maps, at_rest.system), _with_zeros(tangents[2]), fitted)
 
 
 @partial(compiled, kept=True, static_argnums=0)
@@ -225,10 +230,9 @@ def _linearised(
     return fitted, (along_inputs, along_net)
 
 
-@compiled
-def _along(maps: tuple[LinearMap, LinearMap], system: NewtonSystem, change: FitInputs) -> Fitted:
+def _along(known: tuple[tuple[LinearMap, LinearMap], NewtonSystem], change: FitInputs) -> Fitted:
     """The derivative along a change of the inputs."""
-    along_inputs, along_net = maps
+    (along_inputs, along_net), system = known
     right, held = along_inputs(change)
     accuracy = float(jnp.finfo(right.dtype).eps) ** ACCURACY
     move = system.solved_differentiably(lambda x: along_net(x)[0], -right, accuracy)
@@ -248,17 +252,21 @@ def _residual_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit) -> Residua
         feet = feet_in_rows(surface, end.problem, u, v)
         args = (method, end.state, end.surface.moved_to(net), problem, feet)
         found = stationarity_residual(*args, system.free, still)
-        return found.value, _outward(end, inputs, at_rest, net, found)
+        return found.value, _outward(end, inputs, at_rest, net, found, feet.rows)
 
     return residual
 
 
 def _outward(
-    end: EndOfFit, inputs: FitInputs, at_rest: PolishedFit, net: Array, found: StationarityResidual
+    end: EndOfFit,
+    inputs: FitInputs,
+    at_rest: PolishedFit,
+    net: Array,
+    found: StationarityResidual,
+    rows: Rows,
 ) -> Fitted:
     """In the user's unit and the order of the points."""
     count, unit = inputs.points.shape[0], end.unit
-    rows = feet_in_rows(end.surface, end.problem, at_rest.projection.u, at_rest.projection.v).rows
     number = end.order[jnp.minimum(rows.point, end.order.shape[0] - 1)]
     number = jnp.where(rows.filled, number, count)
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._distance_rows import normal_equations, rows_with_influence
+from jaxfit._approximation._distance_rows import normal_equations
+from jaxfit._cells import Rows
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._working_surface import WorkingSurface
@@ -68,16 +69,19 @@ def newton_system(
     state: Any,
     surface: WorkingSurface,
     problem: Problem,
+    rows: Rows,
     feet: tuple[Array, Array],
     error: Float[Array, " points"],
     shift: Any = 0.0,
 ) -> NewtonSystem:
-    """With the factors of the Gauss-Newton matrix, whose rows are blended with those at fixed parameters."""
+    """With the factors of the Gauss-Newton matrix, whose rows are blended with those at fixed parameters.
+
+    `rows` hold the points at their feet.
+    """
     condition = method.stationarity(problem, surface, state, error)
     damping = jnp.minimum(DAMPING + shift, 1.0) if method.finds_feet else 1.0
     damping = jnp.asarray(damping, error.dtype)
     weighted = *feet, condition.weight
-    rows = rows_with_influence(surface.pieces, *weighted)
     matrix = normal_equations(problem, surface.pieces, rows, *weighted, damping).matrix
     fixed = matrix.at_fixed_parameters(damping)
     between = fixed.times(jnp.sqrt(damping))  # as in a step of the fit

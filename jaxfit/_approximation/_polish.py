@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit._approximation._damping import longest_moves
 from jaxfit._approximation._newton_system import NewtonSystem, newton_system
 from jaxfit._approximation._stationarity_residual import (
+    FeetInRows,
     feet_in_rows,
     stationarity_residual,
 )
@@ -83,16 +84,17 @@ def polished(
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
 
-    def system_at(there: WorkingSurface, here: Projection, shift: Array) -> NewtonSystem:
-        return newton_system(method, state, there, problem, (here.u, here.v), here.error, shift)
+    def found_at(there: WorkingSurface, here: Projection, shift: Array) -> tuple[FeetInRows, NewtonSystem]:
+        places = here.u, here.v
+        feet = feet_in_rows(there, problem, *places)
+        return feet, newton_system(method, state, there, problem, feet.rows, places, here.error, shift)
 
     def advance(now: _State) -> _State:
         old, there = now.accepted, surface.moved_to(now.trial)
         here = _measured(method, problem, there, old.projection)
-        system = system_at(there, here, now.shift)
+        feet, system = found_at(there, here, now.shift)
         free = jnp.where(now.begun, now.system.free, system.free)  # the same for all steps
         system = eqx.tree_at(lambda s: s.free, system, free)
-        feet = feet_in_rows(there, problem, here.u, here.v)
 
         def residual(net: Array) -> tuple[Array, Any]:
             moved = surface.moved_to(net)
@@ -120,7 +122,7 @@ def polished(
 
     nothing, yes = jnp.zeros((), still.dtype), jnp.asarray(True)
     first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
-    unknown = jax.eval_shape(system_at, surface, projection, nothing)
+    unknown = jax.eval_shape(found_at, surface, projection, nothing)[1]
     system = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
     begin = _State(first, system, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes, ~yes)
     last = lax.while_loop(lambda now: ~now.done, advance, begin)

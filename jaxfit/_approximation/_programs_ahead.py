@@ -8,6 +8,7 @@ from jaxfit._approximation._errors import GlobalFeet
 from jaxfit._approximation._room import Room
 from jaxfit._closest import Newton, compile_search_ahead
 from jaxfit._compile_ahead import is_first
+from jaxfit._fit._adjoints import UnrolledAdjoint
 from jaxfit._fit._loop import compile_ahead
 from jaxfit._fit._method import AbstractIterativeMethod, static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
@@ -23,14 +24,14 @@ def programs_ahead(
     count: int,
     request: dict[str, Any],
     room: Room | None,
+    differentiated: bool = False,
 ) -> None:
     """Begin to compile the search for closest points, if there will be any, and the iteration.
 
-    All is concrete. Nothing is begun where a derivative is asked for: the method may have none, and unrolled
-    fits have a program of their own.
+    All is concrete. Nothing is begun for unrolled fits, which have a program of their own.
     """
     steps = request["max_steps"] if room is None else room.steps
-    if request["adjoint"] is not None:
+    if isinstance(request["adjoint"], UnrolledAdjoint):
         return
     if not is_first(
         static_fields(method), begun.control_points.shape, problem.target.shape, problem.target.dtype, steps
@@ -39,7 +40,7 @@ def programs_ahead(
     if request["start"] is None or isinstance(request["errors"], GlobalFeet | None):
         chunk = None if room is None else room.chunk
         compile_search_ahead(Newton(), begun.control_points, *begun.axes, count, chunk)
-    compile_ahead(method, problem, begun, steps)
+    compile_ahead(method, problem, begun, steps, differentiated)
 
 
 def programs_of_cloud_ahead(
@@ -49,6 +50,7 @@ def programs_of_cloud_ahead(
     order: tuple[int, int],
     request: dict[str, Any],
     room: Room | None = None,
+    differentiated: bool = False,
 ) -> None:
     """`programs_ahead` of a fit whose base surface is still to be made."""
     cloud, dtype = np.asarray(points), working_dtype()
@@ -60,4 +62,4 @@ def programs_of_cloud_ahead(
     begun = plane((*net, cloud.shape[1]), order, dtype)
     if room is not None:
         begun = begun.padded(room.net[0] - net[0], room.net[1] - net[1])
-    programs_ahead(method, problem, begun, len(cloud), request, room)
+    programs_ahead(method, problem, begun, len(cloud), request, room, differentiated)

@@ -90,15 +90,29 @@ def run(
 
 
 def compile_ahead(
-    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, max_steps: int
+    method: AbstractIterativeMethod,
+    problem: Problem,
+    surface: WorkingSurface,
+    max_steps: int,
+    differentiated: bool = False,
 ) -> None:
-    """Begin to compile what `run` calls, all concrete. Where the points start does not matter."""
+    """Begin to compile what `run` calls, all concrete. Where the points start does not matter. A fit that is
+    to be `differentiated` by a method without a derivative will be refused.
+    """
     somewhere = np.zeros(problem.weight.shape, problem.target.dtype)
     with contextlib.suppress(
         Exception
     ):  # what a method of the user's can't do from there, it will say in `run`
         loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
+        if differentiated:
+            check_derivative(method, problem, loop)
         _advance.ahead(*static_and_numbers(method), problem, problem.tolerances.max_steps, loop)
+
+
+def check_derivative(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> None:
+    """Have a method that has no implicit derivative say so."""
+    here = loop.current
+    jax.eval_shape(method.stationarity, problem, here.surface, here.state, here.projection.error)
 
 
 @partial(compiled, kept=True, static_argnums=0)

@@ -52,8 +52,8 @@ def gmres_solve(
 
     def cycle(state: State) -> State:
         x, residual, step, history, _ = state
-        moved = x + gmres_cycle(apply, precondition, precondition(residual), restart)
-        rest = right - apply(moved)
+        move, image = gmres_cycle(apply, precondition, precondition(residual), restart)
+        moved, rest = x + move, residual - image
         before, after = history.at(step)[1], jnp.max(distances(rest, limits.diagonal))
         better = after < before
         x, residual = (jnp.where(better, new, old) for new, old in ((moved, x), (rest, residual)))
