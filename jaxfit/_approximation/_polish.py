@@ -32,6 +32,9 @@ REACH = 0.6  # of the distance between control points: the longest move in a ste
 GOOD, POOR, LOWERED, RAISED = 0.75, 0.25, 0.3, 4.0
 FIRST_SHIFT, TAKEN_BACK, LEAST_SHIFT, MOST_SHIFT = 1e-4, 10.0, 1e-8, 1e2
 GROWTH = 4.0  # of |G| in an accepted step
+# Where |G| is still more than FAR of its terms after so many steps, or a tenth of all that are allowed, the
+# surface at rest is another one.
+FAR, PATIENCE = 0.5, 10
 
 
 class PolishedFit(eqx.Module):
@@ -75,7 +78,8 @@ def polished(
     state: Any,
     projection: Projection,
 ) -> PolishedFit:
-    r"""Newton steps until G, relative to its terms, is below `goal`, or `most` steps, or nothing helps.
+    r"""Newton steps until G, relative to its terms, is below `goal`, or `most` steps, or nothing helps, or
+    the surface is still far from rest after a tenth of them.
 
     A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
     where $(G_0 + G_1) \cdot \delta P < 0$. To third order that is twice the change of the objective of which
@@ -117,7 +121,8 @@ def polished(
         done = good & ((new.size <= least) | (now.steps >= most))
         trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
         new, system = jax.tree.map(lambda x, y: jnp.where(good, x, y), (new, system), (old, now.system))
-        ended = done | (shift > MOST_SHIFT)
+        far = (now.steps >= jnp.maximum(PATIENCE, most // 10)) & (new.size > FAR * new.terms)
+        ended = done | (shift > MOST_SHIFT) | far
         return _State(new, system, trial, predicted, shift, now.steps + good, ~good, yes, ended)
 
     nothing, yes = jnp.zeros((), still.dtype), jnp.asarray(True)

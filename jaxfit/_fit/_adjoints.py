@@ -116,7 +116,9 @@ class ImplicitAdjoint(AbstractAdjoint):
         precision above the residual times the ratio of the rounding units (5e-4).
     polish_steps : int
         The largest number of Newton steps (default 100; most fits need less than 20). Where they are rejected
-        they are damped. 0 leaves the surface as it is. Approximation only.
+        they are damped. Where the stationarity is more than 0.5 after a tenth of them, and at least 10, they
+        end: the surface at rest would be quite another one. 0 leaves the surface as it is. Approximation
+        only.
 
     Raises
     ------
