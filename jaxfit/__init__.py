@@ -50,13 +50,13 @@ from jaxfit._fit import Fit as Fit
 from jaxfit._fit import FixedBorder as FixedBorder
 from jaxfit._fit import FixedCorners as FixedCorners
 from jaxfit._fit import FixedSides as FixedSides
+from jaxfit._fit import FootPoints as FootPoints
 from jaxfit._fit import FreeBorder as FreeBorder
 from jaxfit._fit import History as History
 from jaxfit._fit import ImplicitAdjoint as ImplicitAdjoint
 from jaxfit._fit import Iterate as Iterate
 from jaxfit._fit import Problem as Problem
-from jaxfit._fit import Projection as Projection
-from jaxfit._fit import Stationarity as Stationarity
+from jaxfit._fit import StationarityCondition as StationarityCondition
 from jaxfit._fit import UnrolledAdjoint as UnrolledAdjoint
 from jaxfit._fit import WorkingSurface as WorkingSurface
 from jaxfit._fit import held_points as held_points

@@ -15,8 +15,8 @@ from pathlib import Path
 from jaxfit import _interrupt, io
 from jaxfit._cli_arguments import argument_parser
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read, read_and_written
-from jaxfit._cli_page import write_page
-from jaxfit._cli_report import as_sentence, print_table
+from jaxfit._cli_output import as_sentence, print_table
+from jaxfit._cli_report import write_page
 from jaxfit._cli_session import choose_precision, set_compile_cache, trace_quickly
 from jaxfit._fit._summary import facts
 from jaxfit._progress_line import show_nothing, write_log

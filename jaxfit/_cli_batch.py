@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from jaxfit import io
-from jaxfit._base._default_net import checked_net
+from jaxfit._base._default_net import checked_net_shape
 from jaxfit._cli_batch_file import Job, failed, fit_file, job_of, size_of
 from jaxfit._cli_fit import read_and_written
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row, Table
@@ -18,7 +18,7 @@ _CODES = {FITTED: 0, MISSED: 1, FAILED: 3}
 def batch_command(args: argparse.Namespace) -> int:
     """Fit the files that are not yet in the table; return the exit code."""
     if args.net is not None:
-        checked_net(args.net, args.order)
+        checked_net_shape(args.net, args.order)
     folder = Path(args.output)
     table = Table(folder)
     jobs = _jobs(args, folder, table)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxfit import io
 from jaxfit._cli_fit import FitOfFile, fitted_surface, read
 from jaxfit._cli_methods import OPTIONS as METHOD_OPTIONS
-from jaxfit._cli_report import as_sentence
+from jaxfit._cli_output import as_sentence
 from jaxfit._cli_session import choose_precision, set_compile_cache
 from jaxfit._cli_table import FAILED, FITTED, MISSED, Row
 from jaxfit._fit._summary import left_out

@@ -13,7 +13,7 @@ import jaxfit
 from jaxfit import io
 from jaxfit._checks import check_magnitude
 from jaxfit._cli_methods import asks_for_cloud, asks_for_grid, fit_options, interpolates
-from jaxfit._cli_report import as_sentence
+from jaxfit._cli_output import as_sentence
 from jaxfit._scan import is_nodata
 
 TERRAIN = "jacksboro"

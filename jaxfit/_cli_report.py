@@ -1,47 +1,48 @@
-"""What the command line shows: its table, plain text where rich is missing, and its sentences."""
+"""The page that `--report` writes: what was read, what was asked, and the fit."""
 
-import importlib.util
-import re
-import sys
+import argparse
 from collections.abc import Mapping
+from typing import Any
 
-# Options that sentences of the library name as in Python; not as a part of a file's name.
-_IN_PYTHON = re.compile(r"(?<![\w./\\-])(hole_length|tol_average|tol_maximum|max_steps)(?![\w-]|[./\\]\w)")
-REWORDED = {  # what else they say in Python
-    " (fit.regularity.fold_parameters)": "",
-    "StandardInterpolation()": "--method interpolate-standard",
-    "border=FreeBorder()": "--border free",
-    "a method with loss=Tukey()": "--loss tukey",
-    "by fit_points, as a cloud": "by --method approximate",
-    "work in float64 (the flag jax_enable_x64 of jax.config)": "leave out --float32",
-    "switch on double precision, the flag jax_enable_x64 of jax.config": "leave out --float32",
-    "switch on jax_enable_x64": "leave out --float32",
-    "loosen them, or pass a net.": "loosen them, or give a net by --net.",
-}
+from jaxfit import io
+from jaxfit._cli_arguments import argument_parser
+from jaxfit._cli_fit import FittedFile
+from jaxfit._cli_methods import OPTIONS
+
+_SETTINGS = "method net order grid hole_length tol_average tol_maximum max_steps float32".split()
 
 
-def as_sentence(error: object) -> str:
-    """What the library says in one line, its options by the names they have on the command line."""
-    line = " ".join(str(error).split())
-    for python, reworded in REWORDED.items():
-        line = line.replace(python, reworded)
-    return _IN_PYTHON.sub(lambda found: "--" + found[1].replace("_", "-"), line)
+def write_page(
+    args: argparse.Namespace,
+    data: io.PointData,
+    done: FittedFile,
+    read: Mapping[str, str],
+    written: Mapping[str, str],
+) -> None:
+    """Write ``args.report``; `read` and `written` are rows of the command's table."""
+    from jaxfit.plot import report
+
+    report(
+        done.fit,
+        args.report,
+        points=data.cloud if data.grid is None else data.grid,
+        title=data.name,
+        tables={"Input": read, "Settings": _settings(args, done), "Output": written},
+    )
 
 
-def print_table(rows: Mapping[str, str]) -> None:
-    """Print names and values in two columns on stdout: whole lines where no terminal has a width."""
-    if importlib.util.find_spec("rich") is None or not sys.stdout.isatty():
-        width = max(map(len, rows))
-        for name, value in rows.items():
-            print(f"{name:<{width}}  {value}")
-        return
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
+def _settings(args: argparse.Namespace, done: FittedFile) -> dict[str, str]:
+    """The tolerances, and the options that were given, by the names they have on the command line."""
+    defaults = argument_parser().parse_args(["fit", "", "-o", ""])
+    names = [name for name in (*_SETTINGS, *OPTIONS) if getattr(args, name) != getattr(defaults, name)]
+    said = {name: _said(name, getattr(args, name)) for name in names}
+    options = {f"--{name.replace('_', '-')}": value for name, value in said.items()}
+    return {"tolerances": done.tolerances, **options}
 
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows.items():
-        table.add_row(name, Text(value))  # no markup: file names may hold brackets
-    Console().print(table)
+
+def _said(name: str, value: Any) -> str:
+    if isinstance(value, tuple):
+        return "{}x{}".format(*value)
+    if name.startswith("tol_"):
+        return f"{value:g} %"
+    return "yes" if value is True else str(value)

@@ -33,7 +33,7 @@ folder: Path | None = None
 _loaded: dict[Path, Any] = {}
 
 
-class Unspoken(Exception):
+class NoStableName(Exception):
     """A value has no name that means the same in every process."""
 
 
@@ -80,7 +80,7 @@ def _key(name: str, static: tuple[Any, ...], taken: tuple[Any, ...]) -> str | No
         return None
     try:
         about = (_spelled(static), _spelled(taken, arrays=True))
-    except Unspoken:
+    except NoStableName:
         return None
     words = (version_of_code(), _machine(), _settings(), name, *about)
     return hashlib.sha256("\n".join(words).encode()).hexdigest()
@@ -170,7 +170,7 @@ def _spelled(value: Any, arrays: bool = False) -> str:
     """`value` in words; of leaves only type, shape and dtype if they are `arrays` that a program takes."""
     if arrays and isinstance(value, (np.ndarray, np.generic, jax.Array, bool, int, float, complex)):
         if isinstance(value, jax.Array) and (value.devices() != set(jax.devices()) or _has_mesh(value)):
-            raise Unspoken
+            raise NoStableName
         kind = jax.typeof(value)
         return f"{kind.dtype}{kind.shape}{kind.weak_type}"
     if isinstance(value, enum.Enum):
@@ -191,7 +191,7 @@ def _spelled(value: Any, arrays: bool = False) -> str:
         return f"dict({','.join(f'{_spelled(k)}:{_spelled(x, arrays)}' for k, x in value.items())})"
     if dataclasses.is_dataclass(value):
         return f"{_name(type(value))}({','.join(_fields(value, arrays))})"
-    raise Unspoken
+    raise NoStableName
 
 
 def _has_mesh(value: jax.Array) -> bool:
@@ -208,5 +208,5 @@ def _name(value: Any) -> str:
     """Where a class or function is defined, if that is in code whose versions we tell apart."""
     module, name = getattr(value, "__module__", None) or "", getattr(value, "__qualname__", "<")
     if "<" in name or module.split(".")[0] not in ("builtins", "jaxfit", *TRACED_WITH):
-        raise Unspoken
+        raise NoStableName
     return f"{module}.{name}"

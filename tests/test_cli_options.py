@@ -8,7 +8,7 @@ import pytest
 from helpers import CHECKOUT, wavy_cloud, wavy_grid, wavy_surface
 
 import jaxfit
-from jaxfit import _cli, _cli_report, plot
+from jaxfit import _cli, _cli_output, plot
 from jaxfit.io import read_surface
 
 
@@ -392,7 +392,7 @@ def test_a_grid_without_a_boundary_says_why(fits, folder, capsys):
 @pytest.mark.parametrize("rich", [True, False])
 def test_the_table_says_all(fits, folder, capsys, monkeypatch, rich):
     if not rich:
-        monkeypatch.setattr(_cli_report.importlib.util, "find_spec", lambda name: None)
+        monkeypatch.setattr(_cli_output.importlib.util, "find_spec", lambda name: None)
     assert run("grid.npz") == 0
     captured = capsys.readouterr()
     assert captured.err == ""
@@ -447,10 +447,10 @@ def test_where_a_grid_folds_its_sides_are_asked_for(fits, folder, capsys, argv, 
 
 
 def test_what_is_reworded_for_the_command_line_is_said_somewhere():
-    sources = [path.read_text() for path in (CHECKOUT / "jaxfit").rglob("*.py") if path.stem != "_cli_report"]
+    sources = [path.read_text() for path in (CHECKOUT / "jaxfit").rglob("*.py") if path.stem != "_cli_output"]
     nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
     texts = [str(node.value) for node in nodes if isinstance(node, ast.Constant)]
-    for python in _cli_report.REWORDED:
+    for python in _cli_output.REWORDED:
         assert any(python in text for text in texts), python
 
 

@@ -267,7 +267,7 @@ def test_in_single_precision_the_fit_is_polished_to_rounding():
 
 
 def test_raw_scans_refuse_to_be_differentiated_before_they_are_meshed(monkeypatch):
-    monkeypatch.setattr("jaxfit._approximation._fit_scan.sheet_of", None)
+    monkeypatch.setattr("jaxfit._approximation._fit_without_boundary.sheet_of", None)
     with pytest.raises(TypeError, match="boundary must be given where"):
         jax.grad(lambda weights: jf.fit_points(POINTS, weights=weights).average_error)(WEIGHTS)
     with pytest.raises(TypeError, match="boundary must be given where"):

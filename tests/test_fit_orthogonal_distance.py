@@ -21,7 +21,7 @@ from jaxfit._approximation._damping import (
     within_reach,
 )
 from jaxfit._approximation._distance_rows import normal_equations, rows_with_influence
-from jaxfit._approximation._second_order import second_order_rhs
+from jaxfit._approximation._second_order_correction import second_order_rhs
 from jaxfit._fit._problem import Tolerances, make_problem
 from jaxfit._fit._scaling import unit_of
 from jaxfit._fit._working_surface import WorkingSurface
@@ -131,7 +131,7 @@ def test_the_coupled_system_is_solved(laid_out, factored, turned, monkeypatch):
     got = rows(0.1)
     matrix, right = got.matrix, got.gradient
     if turned:
-        matrix, right, net = matrix.transposed(), right.swapaxes(0, 1), net.swapaxes(0, 1)
+        matrix, right, net = matrix.with_directions_swapped(), right.swapaxes(0, 1), net.swapaxes(0, 1)
     free = jnp.zeros(net.shape[:2], bool).at[1:-1, 1:-1].set(True)
     near = coupled_preconditioner(matrix, matrix.trace, free)
     solution = jax.jit(lambda m, r: solve_coupled(m, r, free, near, 1e-12, 500))(matrix, right)

@@ -11,7 +11,7 @@ from normal_reference import design, thin_plate_matrix
 
 import jaxfit as jf
 from jaxfit._approximation._automatic_smoothing import SmoothingCandidates
-from jaxfit._approximation._least_squares import StructuredSolver, least_squares_problem
+from jaxfit._approximation._linear_least_squares import StructuredSolver, least_squares_problem
 from jaxfit._normal_equations import make_system
 from jaxfit._splines._pieces import make_pieces
 

@@ -199,7 +199,7 @@ def test_what_holds_code_of_the_user_is_not_kept(kept):
 
 @pytest.mark.parametrize("value", [OfTheUser(), lambda x: x, object(), {"a": [OfTheUser]}])
 def test_a_value_without_a_lasting_name_has_no_key(value):
-    with pytest.raises(_kept_programs.Unspoken):
+    with pytest.raises(_kept_programs.NoStableName):
         _kept_programs._spelled(value)
 
 

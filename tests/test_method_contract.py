@@ -45,7 +45,7 @@ class HeavyBall(jf.AbstractIterativeMethod):
         )
         active = jnp.sum(problem.counted, dtype=jnp.int32)
         parts = feet.u, feet.v, feet.error, feet.evaluations, feet.converged
-        here = jf.Projection(*parts, active, jnp.asarray(True))
+        here = jf.FootPoints(*parts, active, jnp.asarray(True))
         return here, self.State(found.means, iterate.state.velocity)
 
     def accept(self, problem, old, new):

@@ -17,12 +17,12 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxfit._approximation._least_squares import least_squares_problem
+from jaxfit._approximation._linear_least_squares import least_squares_problem
 from jaxfit._cells import evaluate_jet, row_coefficients
 from jaxfit._checks import check_number
 from jaxfit._compile import compiled
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import BlockCholesky, NormalOperator, RegularisedSystem, free_points
 from jaxfit._splines._pieces import pieces_on
@@ -213,7 +213,7 @@ def _normals(system: RegularisedSystem, net: Float[Array, "nu nv 3"]) -> Float[A
 
 
 def select_smoothing(
-    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
+    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: FootPoints
 ) -> Float[Array, ""]:
     """The lambda for a fit that starts from `surface` and its feet."""
     without = eqx.tree_at(lambda m: m.smoothing, method, 0.0)
@@ -222,7 +222,7 @@ def select_smoothing(
 
 @partial(compiled, kept=True, static_argnums=(0, 1))
 def _select(
-    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: Projection
+    rule: Any, method: Any, problem: Problem, surface: WorkingSurface, projection: FootPoints
 ) -> Float[Array, ""]:
     """Each round selects lambda, solves with it, and corrects the parameters."""
     held, diagonal, net = method.held(surface), problem.diagonal, surface.control_points
@@ -231,7 +231,7 @@ def _select(
     def selected(first: Any) -> Float[Array, ""]:
         """The lambda after all rounds, and before them `first` rounds that keep to few parameters."""
 
-        def one_round(index: Any, last: tuple[Array, Projection, Array]) -> tuple[Array, Projection, Array]:
+        def one_round(index: Any, last: tuple[Array, FootPoints, Array]) -> tuple[Array, FootPoints, Array]:
             net, here, _ = last
             system = method.system(problem, surface.moved_to(net), here, jnp.zeros((), net.dtype))
             candidates = evaluate_candidates(system, held, net, rule.candidates)

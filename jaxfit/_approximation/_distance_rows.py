@@ -23,18 +23,18 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._foot_tangents import FootTangents
+from jaxfit._approximation._free_tangents import FreeTangents
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Rows,
     cells_to_net,
     evaluate_first_order,
     local_coordinates,
-    over_blocks,
     row_coefficients,
     row_moments,
     row_width,
     rows_of,
+    sum_over_blocks,
 )
 from jaxfit._normal_equations import CoupledStencil, coupled_stencil
 from jaxfit._splines._pieces import Pieces
@@ -87,7 +87,7 @@ def normal_equations(
         jnp.zeros((pieces.cells, 2 * order_u - 1, (2 * order_v - 1) * pairs), u.dtype),
         jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype),
     )
-    done = over_blocks(rows, add, begin)
+    done = sum_over_blocks(rows, add, begin)
     matrix = coupled_stencil(done.squares, pieces.axis_u, pieces.axis_v, d)
     gradient = cells_to_net(done.right, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
     return NormalEquations(matrix, gradient)
@@ -103,7 +103,7 @@ def _rows_at(
     always = u[0, 0] >= pieces.axis_u.breaks[0]
     value, *tangents = materialise(always, evaluate_first_order, coefficients, s, t)
     e = target - value
-    tangential = FootTangents.at(pieces, u, v, e, *tangents).entries()
+    tangential = FreeTangents.at(pieces, u, v, e, *tangents).entries()
     d = target.shape[0]
     same = jnp.asarray(np.equal(*np.triu_indices(d)), s.dtype)[:, None, None]
     return s, t, weight[None] * e, weight[None] * (same - (1.0 - damping) * tangential)

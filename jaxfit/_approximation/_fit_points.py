@@ -11,8 +11,8 @@ from jaxfit._approximation._approximate import approximate, default_method
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._checked_scan import checked_scan
 from jaxfit._approximation._cloud_fit import LEAST_POINTS
-from jaxfit._approximation._fit_growing import fit_growing
-from jaxfit._approximation._fit_scan import fit_scan
+from jaxfit._approximation._fit_on_grown_net import fit_on_grown_net
+from jaxfit._approximation._fit_without_boundary import fit_without_boundary
 from jaxfit._approximation._growing_net import LEAST_POINTS as LEAST_POINTS_TO_GROW
 from jaxfit._approximation._growing_net import NetGrowth
 from jaxfit._approximation._level_nets import BoundaryNets
@@ -26,7 +26,7 @@ from jaxfit._base import (
     check_net_of_cloud,
     check_same_place,
     checked_boundary,
-    checked_net,
+    checked_net_shape,
     default_base,
     default_net,
     far_sides,
@@ -213,9 +213,9 @@ def fit_points(
         growth = NetGrowth(nets.points, nets, default_method(method), request)
         growth.compile_ahead()
         doing("making a base surface")
-        fit = fit_growing(growth)
+        fit = fit_on_grown_net(growth)
     else:
-        net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net(net, order)
+        net = default_net(cloud.shape[0], boundary, order) if net is None else checked_net_shape(net, order)
         check_net_of_cloud(net, cloud.shape[0])
         values, implicit = without_derivatives(method), not is_concrete(cloud, method, options)
         if is_concrete(values, known):
@@ -280,14 +280,14 @@ def _without_boundary(
         )
     scan = checked_scan(points, faces, hole_length, base, options.get("start"))
     finite = np.isfinite(scan.points).all(axis=1)
-    if finite.any():  # or else `fit_scan` says what is wrong
+    if finite.any():  # or else `fit_without_boundary` says what is wrong
         whole = np.where(finite[:, None], scan.points, scan.points[np.argmax(finite)])
         checked_request(whole, method=method, **options)
     if net is not None:
-        net = checked_net(net, order)
+        net = checked_net_shape(net, order)
         check_net_of_cloud(net, int(finite.sum()))
     grows = net is None and _may_grow(scan.points[finite], method, options)
-    return fit_scan(scan, net, order, method, _DEFAULTS | options, grows)
+    return fit_without_boundary(scan, net, order, method, _DEFAULTS | options, grows)
 
 
 def _may_grow(cloud: Any, method: Any, options: dict[str, Any]) -> bool:

@@ -10,20 +10,20 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._control_point_sums import ControlPointSums, WeightedErrors
-from jaxfit._approximation._extrapolation import Extrapolation
-from jaxfit._approximation._fairing import Fairing
+from jaxfit._approximation._foot_extrapolation import FootExtrapolation
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._local_region import local_region
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._nesterov import LARGEST_RELAXATION, Momentum, Nesterov, zero_momentum
+from jaxfit._approximation._net_fairing import Fairing
 from jaxfit._checks import Scalar, check_kind, check_number, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, update_feet
 from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
-from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
 from jaxfit._unrolling import unrolled
@@ -36,7 +36,7 @@ class GeometricState(eqx.Module):
     sums: Float[Any, "nu nv c"]  # of Algorithm 1, at the last projection
     momentum: Momentum | None  # if steps are accelerated
     exceeded: Bool[Any, " points"] | None  # in local mode: points whose error ever exceeded the tolerance
-    extrapolation: Extrapolation | None  # the last step of converged feet, from which the next ones start
+    extrapolation: FootExtrapolation | None  # the last step of converged feet, from which the next ones start
 
 
 class GeometricApproximation(AbstractIterativeMethod):
@@ -163,7 +163,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         return True
 
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, GeometricState]:
         """A surface with room for new knots, and no momentum."""
         surface = room_for(self.insertion, surface, problem.tolerances.max_steps)
@@ -171,7 +171,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         xp: Any = np if is_concrete(net, projection) else jnp
         sums = xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype)
         momentum = None if self.acceleration is None else zero_momentum(net)
-        extrapolation = Extrapolation.initial(projection.u) if self._extrapolates else None
+        extrapolation = FootExtrapolation.initial(projection.u) if self._extrapolates else None
         exceeded = projection.converged if self.local else None
         return surface, GeometricState(sums, momentum, exceeded, extrapolation)
 
@@ -180,7 +180,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         """Whether converging feet start ahead. Weights of a loss need errors at the feet themselves."""
         return not self.single_step and self.loss is None
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, GeometricState]:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[FootPoints, GeometricState]:
         """New feet, converged or one step on, and the sums of Algorithm 1 there."""
         state: GeometricState = iterate.state
         pieces, before = iterate.surface.pieces, iterate.projection
@@ -207,7 +207,7 @@ class GeometricApproximation(AbstractIterativeMethod):
             sums = jnp.where(complete[..., None], sums, 0.0)
         certain = exact | (not self.single_step)
         converged = jnp.where(certain, feet.converged, before.converged)
-        here = Projection(feet.u, feet.v, error, feet.evaluations, converged, active, certain)
+        here = FootPoints(feet.u, feet.v, error, feet.evaluations, converged, active, certain)
         return here, GeometricState(sums, state.momentum, exceeded, extrapolation)
 
     def _feet(
@@ -215,7 +215,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         problem: Problem,
         pieces: Pieces,
         state: GeometricState,
-        before: Projection,
+        before: FootPoints,
         resting: Bool[Array, " points"],
         exact: Array,
     ) -> tuple[FootUpdate, Float[Array, "nu nv c"]]:
@@ -292,7 +292,7 @@ class GeometricApproximation(AbstractIterativeMethod):
 
     def stationarity(
         self, problem: Problem, surface: WorkingSurface, state: GeometricState, error: Array
-    ) -> Stationarity:
+    ) -> StationarityCondition:
         """The weighted means around all control points that move vanish."""
         if self.fairing is not None:
             raise TypeError(
@@ -307,7 +307,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         length = loss_length(self.loss, problem, surface.axes, error)
         weight = reweighted(self.loss, length, problem.weight, error)
         held = held_points(self.border, surface.control_points.shape, surface.used)
-        return Stationarity(weight, held)
+        return StationarityCondition(weight, held)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

@@ -17,25 +17,25 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxfit._approximation._newton_system import NewtonSystem
 from jaxfit._approximation._polish import PolishedFit, polished
 from jaxfit._approximation._stationarity_residual import (
     StationarityResidual,
     feet_in_rows,
     stationarity_residual,
 )
+from jaxfit._approximation._stationarity_system import StationaritySystem
 from jaxfit._cells import Rows
 from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
 from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._adjoints import ImplicitAdjoint
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._method import dynamic_fields
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._linear_program import linear_call, transpose_ahead
+from jaxfit._linear_call import linear_call, transpose_ahead
 from jaxfit._precision import default_foot_tolerance, working_dtype
 from jaxfit._splines import BSplineSurface
 from jaxfit._splines._insertion import insertion_weights
@@ -85,7 +85,7 @@ class EndOfFit(eqx.Module):
     problem: Problem
     surface: WorkingSurface
     state: Any
-    projection: Projection
+    projection: FootPoints
     order: Int[Any, " points"]
     unit: Unit
     knots: tuple[Any, Any]  # of the base surface
@@ -230,7 +230,7 @@ def _linearised(
     return fitted, (along_inputs, along_net)
 
 
-def _along(known: tuple[tuple[LinearMap, LinearMap], NewtonSystem], change: FitInputs) -> Fitted:
+def _along(known: tuple[tuple[LinearMap, LinearMap], StationaritySystem], change: FitInputs) -> Fitted:
     """The derivative along a change of the inputs."""
     (along_inputs, along_net), system = known
     right, held = along_inputs(change)

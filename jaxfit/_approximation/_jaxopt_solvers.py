@@ -8,7 +8,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._least_squares import AbstractLeastSquares, LeastSquaresProblem, check_driver
+from jaxfit._approximation._linear_least_squares import (
+    AbstractLeastSquares,
+    LeastSquaresProblem,
+    check_driver,
+)
 
 
 class JaxoptGaussNewton(AbstractLeastSquares):

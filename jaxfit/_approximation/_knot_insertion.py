@@ -15,7 +15,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxfit._checks import check_kind, check_number
-from jaxfit._fit._projection import Projection
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis, make_axis
 
@@ -56,7 +56,7 @@ class KnotInsertion(eqx.Module):
         self,
         step: Array,
         surface: WorkingSurface,
-        projection: Projection,
+        projection: FootPoints,
         counted: Bool[Array, " points"],
     ) -> WorkingSurface:
         """The surface after iteration `step`, refined if it is time by the errors of `counted` points."""

@@ -14,11 +14,11 @@ from jaxfit._base import (
     Coons,
     Meshless,
     MeshlessAt,
+    base_at_parameters,
     base_surface,
     carried_base,
     cloud_of,
     default_base,
-    free_base,
     meshless_at,
     net_of_ratio,
     net_of_sides,
@@ -143,7 +143,7 @@ class SheetNets(AbstractNets):
         some = self.sheet.on_sheet
         points = self.sheet.points[some] * self.sheet.size + self.sheet.centre
         layout = self.sheet.layout(net, self.order)
-        return free_base(points, layout.parameters[some], layout.knots, self.order)
+        return base_at_parameters(points, layout.parameters[some], layout.knots, self.order)
 
     def carried(self, surface: BSplineSurface, net: tuple[int, int]) -> BSplineSurface:
         """A smoothed surface as well: what a coarse net made of the parameters is forgotten."""

@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing
 from jaxfit._approximation._geometric import GeometricApproximation
-from jaxfit._approximation._least_squares import GaussNewton
+from jaxfit._approximation._linear_least_squares import GaussNewton
 from jaxfit._approximation._orthogonal import OrthogonalDistance
 from jaxfit._approximation._smoothing_term import plate_of
 from jaxfit._approximation._standard import StandardApproximation, StandardState
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import NormalOperator, Stencil, free_points, normal_solver
 
@@ -40,7 +40,7 @@ class StandardBySums(StandardApproximation):
     """`StandardApproximation` whose points are summed up where they are measured."""
 
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, StateWithSums]:
         """The state with zeros for sums."""
         surface, state = super().init(problem, surface, projection)
@@ -49,7 +49,7 @@ class StandardBySums(StandardApproximation):
         sums = NormalSums(Stencil(entries), np.zeros(net.shape, net.dtype))
         return surface, StateWithSums(state.smoothing, state.shift, state.plate, sums)
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StateWithSums]:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[FootPoints, StateWithSums]:
         """Feet, and the sums at them."""
         projection, state = super().measure(problem, iterate, exact)
         surface = iterate.surface

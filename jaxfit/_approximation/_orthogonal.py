@@ -28,7 +28,7 @@ from jaxfit._approximation._gauss_newton_step import gauss_newton_step
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
 from jaxfit._approximation._losses import DataTerm, check_loss, loss_length, reweighted, total_cost
 from jaxfit._approximation._regular_smoothing import SETTLED_AT, FoldGuard, RegularSmoothing
-from jaxfit._approximation._second_order import second_order_rhs
+from jaxfit._approximation._second_order_correction import second_order_rhs
 from jaxfit._approximation._smoothing_term import (
     as_smoothing,
     check_smoothing,
@@ -40,11 +40,11 @@ from jaxfit._checks import Scalar, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, FreeBorder, check_border, held_points
 from jaxfit._fit._feet import measure_feet
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
-from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import AbstractPenalty, ThinPlate, WeightedPlate
 from jaxfit._splines._pieces import pieces_on
@@ -206,7 +206,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         return True
 
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, OrthogonalState]:
         """The surface with room for new knots, and a first step with mu = 1, which cannot fail."""
         dtype = problem.target.dtype
@@ -221,7 +221,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         penalty = WeightedPlate(plate_of(plate, surface), smoothing)
         return surface, OrthogonalState(damping, penalty, None, smoothing, plate, sums)
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, OrthogonalState]:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[FootPoints, OrthogonalState]:
         """Converged feet, starting from the last accepted ones, and the folds."""
         surface, state, before = iterate.surface, iterate.state, iterate.projection
         here = measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
@@ -315,7 +315,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
 
     def stationarity(
         self, problem: Problem, surface: WorkingSurface, state: OrthogonalState, error: Array
-    ) -> Stationarity:
+    ) -> StationarityCondition:
         """Half the gradient of F. Factors of RegularSmoothing count as constant, but for those at `least`."""
         length = loss_length(self.loss, problem, surface.axes, error)
         if state.guard is None:
@@ -326,7 +326,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
             guard = self.smoothing.following_least(state.guard)
             penalty = self.smoothing.penalty(guard, surface, problem.diagonal, term)
         held = held_points(self.border, surface.control_points.shape, surface.used)
-        return Stationarity(reweighted(self.loss, length, problem.weight, error), held, penalty)
+        return StationarityCondition(reweighted(self.loss, length, problem.weight, error), held, penalty)
 
     def _refined(self, problem: Problem, iterate: Iterate) -> tuple[WorkingSurface, FoldGuard | None]:
         """The accepted surface, with new knots if it is time; they change neither it nor its feet."""

@@ -9,18 +9,18 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._damping import longest_moves
-from jaxfit._approximation._newton_system import NewtonSystem, newton_system
 from jaxfit._approximation._stationarity_residual import (
     FeetInRows,
     feet_in_rows,
     stationarity_residual,
 )
+from jaxfit._approximation._stationarity_system import StationaritySystem, stationarity_system
 from jaxfit._cells import distances_at
 from jaxfit._closest import Newton
 from jaxfit._fit._feet import measure_feet
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
 
@@ -41,14 +41,14 @@ class PolishedFit(eqx.Module):
     """The surface at rest, its feet, |G| over the norms of its terms, and the linear system there."""
 
     net: Float[Array, "nu nv d"]
-    projection: Projection
-    system: NewtonSystem
+    projection: FootPoints
+    system: StationaritySystem
     stationarity: Float[Array, ""]
 
 
 class _Accepted(eqx.Module):
     net: Float[Array, "nu nv d"]
-    projection: Projection
+    projection: FootPoints
     value: Float[Array, "nu nv d"]  # G
     size: Float[Array, ""]  # its norm
     terms: Float[Array, ""]
@@ -59,7 +59,7 @@ class _State(eqx.Module):
     """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
 
     accepted: _Accepted
-    system: NewtonSystem  # at the accepted net
+    system: StationaritySystem  # at the accepted net
     trial: Float[Array, "nu nv d"]
     predicted: Float[Array, ""]
     shift: Float[Array, ""]
@@ -76,7 +76,7 @@ def polished(
     problem: Problem,
     surface: WorkingSurface,
     state: Any,
-    projection: Projection,
+    projection: FootPoints,
 ) -> PolishedFit:
     r"""Newton steps until G, relative to its terms, is below `goal`, or `most` steps, or nothing helps, or
     the surface is still far from rest after a tenth of them.
@@ -88,10 +88,12 @@ def polished(
     problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
     still = surface.control_points
 
-    def found_at(there: WorkingSurface, here: Projection, shift: Array) -> tuple[FeetInRows, NewtonSystem]:
+    def found_at(
+        there: WorkingSurface, here: FootPoints, shift: Array
+    ) -> tuple[FeetInRows, StationaritySystem]:
         places = here.u, here.v
         feet = feet_in_rows(there, problem, *places)
-        return feet, newton_system(method, state, there, problem, feet.rows, places, here.error, shift)
+        return feet, stationarity_system(method, state, there, problem, feet.rows, places, here.error, shift)
 
     def advance(now: _State) -> _State:
         old, there = now.accepted, surface.moved_to(now.trial)
@@ -155,8 +157,8 @@ def _share_within_reach(surface: WorkingSurface, move: Float[Array, "nu nv d"]) 
 
 
 def _measured(
-    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, before: Projection
-) -> Projection:
+    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, before: FootPoints
+) -> FootPoints:
     """Feet, converged as far as a derivative needs, or without feet the errors at the parameters."""
     if method.finds_feet:
         tolerance = default_foot_tolerance(problem.target.dtype)

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 from jaxfit._approximation._folds import folds_by_cell, near_folds
 from jaxfit._approximation._losses import DataTerm
 from jaxfit._checks import Scalar, check_number, is_concrete
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import Roughness
 
@@ -227,7 +227,7 @@ class RegularSmoothing(eqx.Module):
         return eqx.tree_at(lambda g: g.factor, guard, factor)
 
     def held_back(
-        self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, here: Projection
+        self, guard: "FoldGuard", surface: WorkingSurface, problem: Problem, here: FootPoints
     ) -> Bool[Array, " points"]:
         """Points far from the surface where it has been kept from folding."""
         i, j = (

@@ -9,21 +9,25 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing, select_smoothing
+from jaxfit._approximation._differentiable_solution import unrolled_solution
 from jaxfit._approximation._knot_insertion import KnotInsertion, check_insertion, room_for
-from jaxfit._approximation._least_squares import AbstractLeastSquares, GaussNewton, least_squares_problem
+from jaxfit._approximation._linear_least_squares import (
+    AbstractLeastSquares,
+    GaussNewton,
+    least_squares_problem,
+)
 from jaxfit._approximation._losses import check_loss, loss_length, reweighted
 from jaxfit._approximation._smoothing_term import as_smoothing, check_smoothing, constant_plate, plate_of
-from jaxfit._approximation._unrolled_solution import unrolled_solution
 from jaxfit._cells import distances_at
 from jaxfit._checks import Scalar, check_kind, check_switches, is_concrete
 from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
 from jaxfit._fit._feet import measure_feet
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
-from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._normal_equations import RegularisedSystem, ThinPlate, WeightedPlate, make_system
 from jaxfit._unrolling import unrolled
@@ -132,7 +136,7 @@ class StandardApproximation(AbstractIterativeMethod):
         return 0
 
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, StandardState]:
         """lambda as given, or chosen from the data."""
         if isinstance(self.smoothing, AbstractSmoothing):
@@ -152,7 +156,7 @@ class StandardApproximation(AbstractIterativeMethod):
         self,
         problem: Problem,
         surface: WorkingSurface,
-        projection: Projection,
+        projection: FootPoints,
         smoothing: Any,
         plate: ThinPlate | None = None,
     ) -> RegularisedSystem:
@@ -162,19 +166,19 @@ class StandardApproximation(AbstractIterativeMethod):
         parameters = projection.u, projection.v
         return make_system(surface.pieces, *parameters, problem.target, weight, smoothing, plate)
 
-    def project(self, problem: Problem, surface: WorkingSurface, before: Projection) -> Projection:
+    def project(self, problem: Problem, surface: WorkingSurface, before: FootPoints) -> FootPoints:
         """Feet on the new surface, or without correction the errors at the same parameters."""
         if self.parameter_correction:
             return measure_feet(self.foot_method, problem, surface.pieces, before, self.foot_tolerance)
         real = jnp.asarray(problem.real)
         distance = distances_at(surface.pieces, before.u, before.v, problem.target, real)
         active = jnp.sum(problem.counted, dtype=jnp.int32)
-        return Projection(
+        return FootPoints(
             *(before.u, before.v, distance, before.evaluations, real, active, jnp.asarray(True)),
             before.summary,
         )
 
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, StandardState]:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[FootPoints, StandardState]:
         """Feet, or without correction the errors at the same parameters."""
         return self.project(problem, iterate.surface, iterate.projection), iterate.state
 
@@ -197,14 +201,14 @@ class StandardApproximation(AbstractIterativeMethod):
 
     def stationarity(
         self, problem: Problem, surface: WorkingSurface, state: StandardState, error: Array
-    ) -> Stationarity:
+    ) -> StationarityCondition:
         """Half the gradient of F. A lambda chosen from the data counts as constant."""
         length = loss_length(self.loss, problem, surface.axes, error)
         chosen = isinstance(self.smoothing, AbstractSmoothing)
         smoothing = state.smoothing if chosen else as_smoothing(self.smoothing, error.dtype)
         penalty = WeightedPlate(plate_of(state.plate, surface), jnp.asarray(smoothing))
         weight = reweighted(self.loss, length, problem.weight, error)
-        return Stationarity(weight, self.held(surface), penalty)
+        return StationarityCondition(weight, self.held(surface), penalty)
 
     def postprocess(
         self, problem: Problem, iterate: Iterate, stopped_early: Array

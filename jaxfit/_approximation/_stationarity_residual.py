@@ -1,4 +1,4 @@
-r"""G, the residual of a method's `Stationarity`, as a differentiable function of net and data.
+r"""G, the residual of a method's `StationarityCondition`, as a differentiable function of net and data.
 
 The feet are eliminated: they move with the net and with the points by the implicit derivative of a closest
 point. Points are laid out in rows of one cell at the feet of one net, and the function is exact there, with
@@ -29,7 +29,7 @@ from jaxfit._closest import dot
 from jaxfit._closest._implicit import foot_moves
 from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Pieces
 from jaxfit._unrolling import root_with_slope
@@ -171,7 +171,7 @@ def _times(vectors: Float[Array, "d rows width"], x: Float[Array, "rows width"])
     return jnp.stack([vector * x for vector in vectors])
 
 
-def _half_gradient(condition: Stationarity, net: Array) -> Array:
+def _half_gradient(condition: StationarityCondition, net: Array) -> Array:
     penalty = condition.penalty
     return jnp.zeros_like(net) if penalty is None else 0.5 * jax.grad(penalty.energy)(net)
 

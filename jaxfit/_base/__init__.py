@@ -1,5 +1,6 @@
 """Base surfaces: a first surface from four boundary polylines, and from the cloud where a method uses it."""
 
+from jaxfit._base._base_at_parameters import base_at_parameters as base_at_parameters
 from jaxfit._base._base_method import AbstractBaseMethod as AbstractBaseMethod
 from jaxfit._base._base_method import Coons as Coons
 from jaxfit._base._base_surface import base_surface as base_surface
@@ -15,7 +16,7 @@ from jaxfit._base._default_base import default_base as default_base
 from jaxfit._base._default_base import mean_distance_to as mean_distance_to
 from jaxfit._base._default_net import MOST_CONTROL_POINTS as MOST_CONTROL_POINTS
 from jaxfit._base._default_net import check_net_of_cloud as check_net_of_cloud
-from jaxfit._base._default_net import checked_net as checked_net
+from jaxfit._base._default_net import checked_net_shape as checked_net_shape
 from jaxfit._base._default_net import default_net as default_net
 from jaxfit._base._default_net import default_size as default_size
 from jaxfit._base._default_net import net_of_ratio as net_of_ratio
@@ -25,9 +26,8 @@ from jaxfit._base._delaunay_stars import Stars as Stars
 from jaxfit._base._delaunay_stars import share_on_circles as share_on_circles
 from jaxfit._base._delaunay_stars import stars as stars
 from jaxfit._base._delaunay_stars import supported_planes as supported_planes
-from jaxfit._base._dynamic import DynamicBaseSurface as DynamicBaseSurface
+from jaxfit._base._dynamic_base import DynamicBaseSurface as DynamicBaseSurface
 from jaxfit._base._far_sides import far_sides as far_sides
-from jaxfit._base._free_base import free_base as free_base
 from jaxfit._base._meshless import Meshless as Meshless
 from jaxfit._base._meshless import MeshlessAt as MeshlessAt
 from jaxfit._base._meshless import meshless_at as meshless_at

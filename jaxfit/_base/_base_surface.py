@@ -7,7 +7,7 @@ from jaxfit._base._base_method import AbstractBaseMethod, Coons
 from jaxfit._base._boundary import Boundary, centre_and_size, check_concrete, checked_boundary, farthest
 from jaxfit._base._coons import GREVILLE, AbstractAbscissae, coons_net
 from jaxfit._base._curve_fit import CurveStart, fit_curves
-from jaxfit._base._default_net import checked_net, default_net
+from jaxfit._base._default_net import checked_net_shape, default_net
 from jaxfit._base._host_splines import halve_widest_spans
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._opposite_curves import starts_by_count, starts_by_tolerance
@@ -184,4 +184,4 @@ def _checked_net(
     check_number("tolerance", tolerance, 0.0)
     if not tolerance > 0:
         raise ValueError(f"tolerance must be positive, but is {tolerance}; use for instance 5e-3.")
-    return None if net is None else checked_net(net, order)
+    return None if net is None else checked_net_shape(net, order)

@@ -43,7 +43,7 @@ def net_of_ratio(size: float, ratio: float, order: tuple[int, int], most: int) -
     return nu, nv
 
 
-def checked_net(net: Any, order: tuple[int, int]) -> tuple[int, int]:
+def checked_net_shape(net: Any, order: tuple[int, int]) -> tuple[int, int]:
     """Control points along u and v as whole numbers that suit the order."""
     try:
         nu, nv = (operator.index(x) for x in net)

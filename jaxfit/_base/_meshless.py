@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._base._arc_length import along_sides
+from jaxfit._base._arc_length_parameters import parameters_at_arc_length
 from jaxfit._base._base_method import AbstractBaseMethod
 from jaxfit._base._host_splines import Knots
 from jaxfit._base._meshless_parameters import parameters_of
 from jaxfit._base._normalised_cloud import Cloud, thinned
-from jaxfit._base._smoothed_net import smoothed_net
+from jaxfit._base._regular_net import regular_net
 from jaxfit._base._thin_plate_fit import ThinPlateFit
 from jaxfit._checks import check_number
 
@@ -123,10 +123,10 @@ class MeshlessAt(AbstractBaseMethod):
         self, net: Float[Any, "nu nv d"], knots: Knots, order: tuple[int, int], cloud: Cloud
     ) -> Float[Any, "nu nv d"]:
         """The least-squares net."""
-        places = np.clip(along_sides(self.square, net, knots, order), 0.0, 1.0)
+        places = np.clip(parameters_at_arc_length(self.square, net, knots, order), 0.0, 1.0)
         reach = max(float(np.linalg.norm(x, axis=-1).max()) for x in (self.points, *cloud.sides))
         fit = ThinPlateFit(net, knots, order, places, self.points)
-        return smoothed_net(fit, self.smoothing, self.robust, reach)
+        return regular_net(fit, self.smoothing, self.robust, reach)
 
 
 def meshless_at(method: Meshless, cloud: Cloud) -> MeshlessAt:

@@ -1,7 +1,7 @@
 """Points in rows of one cell, and polynomials evaluated along them: what every fit's speed rests on."""
 
 from jaxfit._cells._blocks import SLOTS_PER_BLOCK as SLOTS_PER_BLOCK
-from jaxfit._cells._blocks import over_blocks as over_blocks
+from jaxfit._cells._blocks import sum_over_blocks as sum_over_blocks
 from jaxfit._cells._layout import cells_of as cells_of
 from jaxfit._cells._layout import distances_at as distances_at
 from jaxfit._cells._layout import local_coordinates as local_coordinates

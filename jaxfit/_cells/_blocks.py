@@ -17,7 +17,7 @@ SLOTS_PER_BLOCK = 4096
 Total = TypeVar("Total")
 
 
-def over_blocks(
+def sum_over_blocks(
     rows: Rows, add: Callable[[Rows, Array, Any], Total], begin: Total, slots: int = SLOTS_PER_BLOCK
 ) -> Total:
     """`add(block, filled, total)` for one block of rows after the other, from `begin`.

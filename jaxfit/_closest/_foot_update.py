@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from jaxfit._closest._differentiable_feet import follow_feet
 from jaxfit._closest._foot_methods import AbstractFootMethod
 from jaxfit._closest._foot_states import FOUND, SUMMED_FOUND, FootLimits, FootStates
 from jaxfit._closest._iterate_feet import PointSums, iterate_feet
 from jaxfit._closest._project import ParameterBounds, in_precision_of, initial_feet
-from jaxfit._closest._unrolled_feet import follow_feet
 from jaxfit._precision import default_foot_tolerance
 from jaxfit._splines._pieces import Pieces
 from jaxfit._unrolling import unrolled

@@ -20,8 +20,8 @@ from jaxfit._cells import (
     make_rows,
     make_single_rows,
     narrow_width,
-    over_blocks,
     row_coefficients,
+    sum_over_blocks,
 )
 from jaxfit._closest._bounds import Bounds, bounds_of_cells, bounds_of_slots
 from jaxfit._closest._foot_methods import AbstractFootMethod
@@ -161,7 +161,7 @@ class _Pass(eqx.Module):
         """All rows, a block of them after the other."""
         width = rows.point.shape[1]
         slots = min(SLOTS_PER_BLOCK, ROWS_PER_BLOCK * width)
-        return over_blocks(rows, self._block, (feet, total), slots)
+        return sum_over_blocks(rows, self._block, (feet, total), slots)
 
     def _block(self, part: Rows, filled: Array, carry: tuple[FootStates, Any]) -> tuple[FootStates, Any]:
         feet, total = carry

@@ -86,7 +86,7 @@ class UnrolledAdjoint(AbstractAdjoint):
 class ImplicitAdjoint(AbstractAdjoint):
     r"""The derivative of the surface that a fit comes to rest at, by the implicit function theorem.
 
-    Of an approximation: where G(P) = 0 is the condition of `Stationarity`, with the feet eliminated,
+    Of an approximation: where G(P) = 0 is the condition of `StationarityCondition`, with the feet eliminated,
 
     $$dP = -\Big(\frac{\partial G}{\partial P}\Big)^{-1} dG,$$
 

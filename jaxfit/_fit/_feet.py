@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxfit._closest import FOOT_STEPS, AbstractFootMethod, ParameterBounds, project, update_feet
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._splines._pieces import Axis, Pieces
 
 
@@ -16,14 +16,14 @@ def measure_feet(
     method: AbstractFootMethod,
     problem: Problem,
     pieces: Pieces,
-    before: Projection,
+    before: FootPoints,
     foot_tolerance: Any,
-) -> Projection:
+) -> FootPoints:
     """Converged local feet, starting from the last ones, and the errors there."""
     idle, tolerance = ~jnp.asarray(problem.real), foot_tolerance * problem.diagonal
     feet, _ = update_feet(method, pieces, problem.target, before.u, before.v, tolerance, idle=idle)
     active = jnp.sum(problem.counted, dtype=jnp.int32)
-    return Projection(
+    return FootPoints(
         *(feet.u, feet.v, feet.error, feet.evaluations, feet.converged, active, jnp.asarray(True)),
         before.summary,
     )
@@ -33,11 +33,11 @@ def measure_grid(
     method: AbstractFootMethod,
     problem: Problem,
     pieces: Pieces,
-    before: Projection,
+    before: FootPoints,
     foot_tolerance: Any,
     held: Bool[Any, " points"],
     within: ParameterBounds | None = None,
-) -> Projection:
+) -> FootPoints:
     """Feet of a grid's points, except those that are `held`.
 
     Feet that do not converge are searched on the borders. `within` are bounds for each foot.
@@ -56,7 +56,7 @@ def measure_grid(
     )
     error = jnp.where(held, 0.0, jnp.sqrt(jnp.where(held, 0.0, feet.squared_distance)))
     active = jnp.sum(problem.counted, dtype=jnp.int32)
-    return Projection(
+    return FootPoints(
         *(feet.best_u, feet.best_v, error, feet.steps, feet.converged, active, jnp.asarray(True)),
         before.summary,
     )

@@ -19,10 +19,10 @@ from jaxtyping import Bool, Int
 
 from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, static_and_numbers
 from jaxfit._fit._problem import Problem, summary_of
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._unrolling import unrolled
@@ -55,7 +55,7 @@ def begin(
     xp: Any = np if is_concrete(surface, u, v) else jnp  # NumPy's arrays cost no calls of their own
     none = xp.zeros_like(u, np.int32)
     nothing = xp.zeros((), np.int32)
-    feet = Projection(u, v, xp.zeros_like(u), none, none > 0, nothing, nothing > 0, np.zeros(4, u.dtype))
+    feet = FootPoints(u, v, xp.zeros_like(u), none, none > 0, nothing, nothing > 0, np.zeros(4, u.dtype))
     surface, state = method.init(problem, surface, feet)
     iterate = Iterate(surface, feet, state, nothing)
     history = ErrorHistory.empty(max_steps, problem.target.dtype)
@@ -191,8 +191,8 @@ def _one_iteration(method: AbstractIterativeMethod, problem: Problem, loop: Loop
 
 
 def _over_all_points(
-    problem: Problem, projection: Projection, before: Projection, state: Any
-) -> tuple[Projection, Any]:
+    problem: Problem, projection: FootPoints, before: FootPoints, state: Any
+) -> tuple[FootPoints, Any]:
     """The projection with its summary, and the state whose `sums`, if it has any, are those over all points:
     one reduction over the devices.
     """

@@ -11,10 +11,10 @@ from jaxtyping import Float, Int
 
 from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
 from jaxfit._closest import AbstractFootMethod
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
-from jaxfit._fit._stationarity import Stationarity
+from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import working_dtype
 
@@ -25,7 +25,7 @@ class Iterate(eqx.Module):
     Attributes
     ----------
     surface : WorkingSurface
-    projection : Projection
+    projection : FootPoints
         Until the surface has been measured, that of the last iterate.
     state : pytree
         What the method remembers.
@@ -35,7 +35,7 @@ class Iterate(eqx.Module):
     Examples
     --------
     >>> u, none = jnp.array([0.25, 0.5]), jnp.zeros(2, jnp.int32)
-    >>> projection = jf.Projection(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
+    >>> projection = jf.FootPoints(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
     >>> knots = np.array([0.0, 0.0, 1.0, 1.0])
     >>> surface = jf.WorkingSurface.of(np.zeros((2, 2, 3)), knots, knots)
     >>> iterate = jf.Iterate(surface, projection, state=(), step=jnp.asarray(0))
@@ -44,7 +44,7 @@ class Iterate(eqx.Module):
     """
 
     surface: WorkingSurface
-    projection: Projection
+    projection: FootPoints
     state: Any
     step: Int[Any, ""]
 
@@ -111,7 +111,7 @@ class AbstractIterativeMethod(eqx.Module):
 
     @abstractmethod
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, Any]:
         """The surface to begin with, usually `surface` itself, and the first state.
 
@@ -120,11 +120,11 @@ class AbstractIterativeMethod(eqx.Module):
         """
 
     @abstractmethod
-    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[Projection, Any]:
+    def measure(self, problem: Problem, iterate: Iterate, exact: Array) -> tuple[FootPoints, Any]:
         """The projection of the points onto the iterate's surface, and the next state.
 
         Start from `iterate.projection`, the feet on the surface before. Where `exact` (traced) holds, feet
-        must have converged; otherwise errors may be predictions, if `Projection.exact` says so.
+        must have converged; otherwise errors may be predictions, if `FootPoints.exact` says so.
         """
 
     @abstractmethod
@@ -153,7 +153,7 @@ class AbstractIterativeMethod(eqx.Module):
 
     def stationarity(
         self, problem: Problem, surface: WorkingSurface, state: Any, error: Float[Any, " points"]
-    ) -> Stationarity:
+    ) -> StationarityCondition:
         """The condition that the method's final surface meets, for the derivative of its fits.
 
         `state` is the last one, and `error` are the distances of the points, here those of `surface`. It is

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._checks import is_concrete
-from jaxfit._fit._projection import Projection
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._scaling import Unit
 from jaxfit._precision import bucket, working_dtype
 
@@ -91,7 +91,7 @@ class Problem(eqx.Module):
         return eqx.tree_at(lambda p: [p.target, p.weight, p.real], self, parts)
 
     def totals(
-        self, projection: Projection, before: Projection
+        self, projection: FootPoints, before: FootPoints
     ) -> tuple[Float[Array, "4"], Float[Array, ""]]:
         """Sums of errors, evaluations and changes over the points of positive weight, and their number; the
         greatest error.

@@ -5,7 +5,7 @@ from jaxfit._interpolation._fixed_parameters import Richardson as Richardson
 from jaxfit._interpolation._geometric import GeometricInterpolation as GeometricInterpolation
 from jaxfit._interpolation._hermite import NormalInterpolation as NormalInterpolation
 from jaxfit._interpolation._interpolate import interpolate as interpolate
-from jaxfit._interpolation._repositioning import ConstantWeight as ConstantWeight
-from jaxfit._interpolation._repositioning import OptimalRepositioning as OptimalRepositioning
-from jaxfit._interpolation._repositioning import UnitWeights as UnitWeights
 from jaxfit._interpolation._standard import StandardInterpolation as StandardInterpolation
+from jaxfit._interpolation._step_weights import ConstantWeight as ConstantWeight
+from jaxfit._interpolation._step_weights import OptimalRepositioning as OptimalRepositioning
+from jaxfit._interpolation._step_weights import UnitWeights as UnitWeights

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._loop import MAX_GROWTH
 from jaxfit._fit._problem import Tolerances
-from jaxfit._interpolation._point_collocation import PointCollocation
+from jaxfit._interpolation._per_point_collocation import PointCollocation
 
 
 class AbstractAcceleration(eqx.Module):

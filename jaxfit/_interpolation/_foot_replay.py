@@ -21,9 +21,9 @@ from jaxfit._compile import compiled
 from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import side_bounds
-from jaxfit._interpolation._point_collocation import PointCollocation, at_cells, control_point_windows
-from jaxfit._interpolation._repositioning import lowest_eigenvalue
+from jaxfit._interpolation._per_point_collocation import PointCollocation, at_cells, control_point_windows
 from jaxfit._interpolation._solution_derivative import with_derivative
+from jaxfit._interpolation._step_weights import lowest_eigenvalue
 from jaxfit._splines._pieces import Axis, make_axis
 
 NOISE = 1e3  # rounding units of the diagonal: the error of a point so close counts as 0

@@ -15,10 +15,10 @@ from jaxfit._closest import AbstractFootMethod, Newton
 from jaxfit._fit._adjoints import AbstractAdjoint, UnrolledAdjoint
 from jaxfit._fit._border import corners
 from jaxfit._fit._feet import measure_grid, side_bounds
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
 from jaxfit._fit._problem import Problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._interpolation._fixed_parameters import (
@@ -36,8 +36,8 @@ from jaxfit._interpolation._method import (
     finish,
     refuse_normals,
 )
-from jaxfit._interpolation._point_collocation import point_collocation
-from jaxfit._interpolation._repositioning import AbstractRepositioning, OptimalRepositioning
+from jaxfit._interpolation._per_point_collocation import point_collocation
+from jaxfit._interpolation._step_weights import AbstractRepositioning, OptimalRepositioning
 from jaxfit._parameters import AbstractParametrisation, ChordLength
 from jaxfit._splines import Reflection
 
@@ -51,7 +51,7 @@ class GeometricInterpolationState(eqx.Module):
     feet: Float[Any, "2 points"]
     bounds: Float[Any, "2 2 points"]
     best: WorkingSurface
-    projection: Projection
+    projection: FootPoints
     maximum: Float[Any, ""]
     path: Float[Any, "moves 2 points"]
     lowest: Float[Any, ""]
@@ -202,7 +202,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
         return True
 
     def init(
-        self, problem: Problem, surface: WorkingSurface, projection: Projection
+        self, problem: Problem, surface: WorkingSurface, projection: FootPoints
     ) -> tuple[WorkingSurface, GeometricInterpolationState]:
         """Nothing is known yet; whoever needs the eigenvalue sets it."""
         xp: Any = np if is_concrete(problem) else jnp
@@ -217,7 +217,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
 
     def measure(
         self, problem: Problem, iterate: Iterate, exact: Array
-    ) -> tuple[Projection, GeometricInterpolationState]:
+    ) -> tuple[FootPoints, GeometricInterpolationState]:
         """Closest points from the last feet, which stay where a closest point is out of bounds."""
         surface = iterate.surface
         state: GeometricInterpolationState = iterate.state

@@ -31,7 +31,7 @@ from jaxfit._interpolation._method import (
     extent_of,
     is_flat,
 )
-from jaxfit._interpolation._repositioning import lowest_eigenvalue
+from jaxfit._interpolation._step_weights import lowest_eigenvalue
 from jaxfit._parameters import AbstractParametrisation, grid_parameters
 from jaxfit._splines import Reflection, averaging_knots
 

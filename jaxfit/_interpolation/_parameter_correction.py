@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxfit._closest import FOOT_STEPS, Newton, project
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._interpolation._gmres import GmresLimits, append_errors, distances, gmres_solve
-from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
+from jaxfit._interpolation._per_point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._solution_derivative import times_last
 from jaxfit._interpolation._tensor_collocation import TensorCollocation
 from jaxfit._splines._pieces import Axis, pieces_on

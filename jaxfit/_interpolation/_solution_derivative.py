@@ -8,7 +8,7 @@ from jax import Array, lax
 
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._interpolation._gmres import GmresLimits, append_errors, distances, gmres_solve
-from jaxfit._interpolation._point_collocation import PointCollocation, point_collocation
+from jaxfit._interpolation._per_point_collocation import PointCollocation, point_collocation
 from jaxfit._interpolation._tensor_collocation import TensorCollocation
 from jaxfit._normal_equations import Operator
 from jaxfit._splines._pieces import Axis

@@ -52,7 +52,7 @@ def factorise(stencil: Stencil | CoupledStencil, free: Bool[Array, "nu nv"]) -> 
     """
     transposed = free.shape[1] > free.shape[0]
     if transposed:
-        stencil, free = stencil.transposed(), free.T
+        stencil, free = stencil.with_directions_swapped(), free.T
     nu, nv = free.shape
     order_u, order_v = stencil.entries.shape[-4:-2]
     entries = jnp.asarray(stencil.entries).reshape(-1, order_u, order_v, nu, nv)

@@ -51,7 +51,7 @@ class CoupledStencil(eqx.Module):
         unit = jnp.eye(self.entries.shape[0], dtype=self.entries.dtype)[:, :, None, None, None, None]
         return CoupledStencil(self.entries + unit * other.entries[None, None])
 
-    def transposed(self) -> "CoupledStencil":
+    def with_directions_swapped(self) -> "CoupledStencil":
         """The same matrix on the net with its directions exchanged."""
         return CoupledStencil(self.entries.transpose(0, 1, 3, 2, 5, 4))
 

@@ -120,11 +120,11 @@ def gmres_cycle(
 
     begin = jnp.asarray(0, jnp.int32), basis, images, projected, jnp.eye(restart + 1, dtype=first.dtype), size
     _, basis, images, projected, rotations, _ = lax.while_loop(unfinished, extend, begin)
-    weights = _least_squares(rotations, projected, size)
+    weights = _linear_least_squares(rotations, projected, size)
     return (weights @ basis[:-1]).reshape(residual.shape), (weights @ images).reshape(residual.shape)
 
 
-def _least_squares(rotations: Array, projected: Array, size: Array) -> Float[Array, " restart"]:
+def _linear_least_squares(rotations: Array, projected: Array, size: Array) -> Float[Array, " restart"]:
     """The weights for which |size e_1 - projected weights| is smallest; the rotations make `projected`
     triangular. What adds nothing to the space has weight 0.
     """

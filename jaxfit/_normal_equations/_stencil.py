@@ -45,7 +45,7 @@ class Stencil(eqx.Module):
         """The matrix times a number."""
         return Stencil(factor * self.entries)
 
-    def transposed(self) -> "Stencil":
+    def with_directions_swapped(self) -> "Stencil":
         """The same matrix on the net with its directions exchanged."""
         return Stencil(self.entries.transpose(1, 0, 3, 2))
 

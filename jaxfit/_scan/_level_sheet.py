@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit._scan._hole_filling import filled_holes
+from jaxfit._scan._gap_closing import with_gaps_closed
 from jaxfit._scan._manifold import Faces, longest_edges, manifold
 
 FLATTEST = 0.2  # the largest spread across the plane, over the smaller one within it
@@ -57,4 +57,4 @@ def level_mesh(nodes: Float[Any, "nodes 3"], length: float) -> Faces:
     left = (b - a)[:, 0] * (c - a)[:, 1] > (b - a)[:, 1] * (c - a)[:, 0]
     faces = np.where(left[:, None], faces, faces[:, [0, 2, 1]])
     faces = manifold(faces[longest_edges(plane, faces) <= length])
-    return filled_holes(plane, faces, length) if len(faces) else faces
+    return with_gaps_closed(plane, faces, length) if len(faces) else faces

@@ -9,14 +9,14 @@ from jaxfit._scan._coarse_mesh import coarse_faces
 from jaxfit._scan._denoised_nodes import denoised_nodes, is_noisy
 from jaxfit._scan._even_choice import even_choice
 from jaxfit._scan._flat_places import flat_places
-from jaxfit._scan._hole_filling import filled_holes
+from jaxfit._scan._gap_closing import with_gaps_closed
 from jaxfit._scan._level_sheet import is_level, level_mesh, level_nodes, principal_frame
 from jaxfit._scan._manifold import Faces, areas, in_use, longest_edges, pieces, single_fans
 from jaxfit._scan._neighbourhood_mesh import neighbourhood_mesh
-from jaxfit._scan._node_gradients import carried_places
 from jaxfit._scan._node_normals import area_without_noise
+from jaxfit._scan._places_of_points import carried_places
 from jaxfit._scan._scan_lines import thinned_along_lines
-from jaxfit._scan._topology import RoughError, largest_piece, sheet_loops
+from jaxfit._scan._topology import TornMeshError, largest_piece, sheet_loops
 
 MOST_NODES = 30_000  # of the mesh; of more points, medians over squares or an even choice
 COMMON_SPACING = 99  # per cent of the points have their sixth neighbour nearer,
@@ -48,7 +48,7 @@ def sheet_mesh(cloud: np.ndarray, faces: Faces | None, length: float | None) -> 
     every, nodes = len(nodes), thinned_along_lines(nodes)
     try:
         return _by_neighbours(cloud, nodes, length, on_lines=len(nodes) < every)
-    except RoughError as error:
+    except TornMeshError as error:
         if is_level(cloud):
             return _level(cloud, length)
         return _without_noise(cloud, nodes, length, error)
@@ -69,23 +69,23 @@ def _by_neighbours(
     if len(found) > COVERED * 2 * len(nodes):
         largest_piece(nodes, found)  # says so if there are several
     if (covered := _coverage(nodes, found)) < COVERED:
-        raise RoughError(
+        raise TornMeshError(
             f"points must lie on one sheet, but neighbours agree on a surface for only "
             f"{covered:.0%} of them; give a boundary, smooth the points, or raise "
             "hole_length where they are sparse."
         )
-    whole = filled_holes(nodes, largest_piece(nodes, found), reach)
+    whole = with_gaps_closed(nodes, largest_piece(nodes, found), reach)
     return _laid_out(cloud, nodes, whole, found, reach, noise=noise), reach
 
 
 def _without_noise(
-    cloud: np.ndarray, nodes: np.ndarray, length: float | None, error: RoughError
+    cloud: np.ndarray, nodes: np.ndarray, length: float | None, error: TornMeshError
 ) -> tuple[SheetMesh, float]:
     """The mesh of fewer nodes, each where many points say; raises `error` where it was not noise."""
     for level in denoised_nodes(nodes) if is_noisy(nodes) else ():
         try:
             return _by_neighbours(cloud, level, length, noise=False)
-        except RoughError:
+        except TornMeshError:
             continue
     raise error
 
@@ -101,7 +101,7 @@ def _from_faces(
         faces, region = coarse_faces(cloud, faces, chosen)
         closed = max(length or 0.0, HOLE_SPACINGS * float(np.median(longest_edges(nodes, faces))))
     whole = largest_piece(nodes, faces)
-    whole = whole if closed is None else filled_holes(nodes, whole, closed)
+    whole = whole if closed is None else with_gaps_closed(nodes, whole, closed)
     reach = length or float(longest_edges(nodes, whole).max())
     return _laid_out(cloud, nodes, whole, faces, reach, region), reach
 

@@ -23,7 +23,7 @@ TUBE_AREA = 2.0  # least area of a tube, times the difference of these
 REMEDY = "cut the points and fit the parts"
 
 
-class RoughError(ValueError):
+class TornMeshError(ValueError):
     """A mesh that noise may have torn or tied together."""
 
 
@@ -63,7 +63,7 @@ def sheet_loops(points: Float[Any, "points 3"], faces: Faces) -> list[Int[np.nda
     characteristic = euler(faces)
     handles = (2 - len(loops) - characteristic) // 2
     if handles > 0:
-        raise RoughError(
+        raise TornMeshError(
             f"points must make a disc with or without holes, but their surface has {handles} "
             f"handle{'s' * (handles != 1)} (Euler characteristic {characteristic}, {len(loops)} boundary "
             f"loops); {REMEDY}, or lower hole_length so that no bridge is made across a gap."

@@ -15,9 +15,9 @@ from jaxfit._approximation._errors import AbstractErrors
 from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._cores import cores
+from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._method import Iterate, static_and_numbers
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
-from jaxfit._fit._projection import Projection
 from jaxfit._fit._scaling import Unit
 from jaxfit._precision import bucket, working_dtype
 from jaxfit._splines import BSplineSurface
@@ -107,12 +107,12 @@ class Passes:
 
     def _measured(
         self, start: int, points: Points, iterate: Iterate, exact: Any, base: BSplineSurface | None
-    ) -> tuple[Projection, Measured]:
+    ) -> tuple[FootPoints, Measured]:
         """One block on the iterate's surface."""
         count = len(points)
         u, v = self._first_feet(points, base) if base is not None else self.feet.read(start, count)
         none = np.zeros(self.size, np.int32)
-        before = Projection(
+        before = FootPoints(
             _padded(u, self.size),
             _padded(v, self.size),
             none.astype(u.dtype),
@@ -140,7 +140,7 @@ class Passes:
 @partial(compiled, kept=True, static_argnums=0)
 def _measure(
     rest: Any, numbers: Any, problem: Problem, iterate: Iterate, exact: Array
-) -> tuple[Projection, Measured]:
+) -> tuple[FootPoints, Measured]:
     method = eqx.combine(numbers, rest)
     projection, state = method.measure(problem, iterate, exact)
     totals, maximum = problem.totals(projection, iterate.projection)

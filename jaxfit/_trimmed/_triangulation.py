@@ -57,7 +57,7 @@ def triangulate(
         if not split.any():
             triangles = triangles[inside_on_host(edges, places[triangles].mean(axis=1))]
             sides = _sides(triangles)
-            far = _far_sides(points_at, places, sides, tolerance)
+            far = _edges_off_surface(points_at, places, sides, tolerance)
             if not far.any() or len(places) >= most:
                 return places, triangles
             split = _among(segments, sides[far], len(places))
@@ -134,7 +134,9 @@ def _among(pairs: Segments, others: Segments, count: int) -> Bool[np.ndarray, " 
     return np.isin(*keys)
 
 
-def _far_sides(points_at: Any, places: Places, sides: Segments, tolerance: float) -> Bool[np.ndarray, " _"]:
+def _edges_off_surface(
+    points_at: Any, places: Places, sides: Segments, tolerance: float
+) -> Bool[np.ndarray, " _"]:
     """Whose chord is farther than the tolerance from the surface's point halfway along it."""
     points = points_at(places)
     start, end = points[sides[:, 0]], points[sides[:, 1]]

@@ -10,7 +10,7 @@ from jaxfit.io._cad_face import face_of
 from jaxfit.io._nets import ClampedNet
 
 
-def step_file(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
+def step_bytes(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
     """The surface, or its part inside the loops, as one face in a STEP file (AP214, millimetres).
 
     Raises
@@ -50,10 +50,10 @@ def step_file(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes
     return buffer.getvalue()
 
 
-def iges_file(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
+def iges_bytes(net: ClampedNet, loops: list[Loop], name: str, note: str) -> bytes:
     """The same as one trimmed surface (entity 144) in an IGES file (millimetres).
 
-    Raises as `step_file`.
+    Raises as `step_bytes`.
     """
     from OCP.IGESControl import IGESControl_Writer
     from OCP.IGESData import IGESData_IGESWriter

@@ -14,7 +14,7 @@ from jaxfit.io._nets import ClampedNet
 _MOST_DEGREE = 11  # of curves in Rhino
 
 
-def rhino_file(net: ClampedNet, loops: list[Loop], name: str) -> bytes:
+def rhino_bytes(net: ClampedNet, loops: list[Loop], name: str) -> bytes:
     """The surface in a .3dm file, to the last bit; without a unit, since the surface has none.
 
     rhino3dm cannot trim a surface. Loops are closed curves on it, which Rhino's command Trim takes.

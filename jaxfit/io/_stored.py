@@ -17,7 +17,7 @@ _KEYS = ("control_points", "knots_u", "knots_v")
 _LOOP_KEYS = ("loop_vertices", "loop_counts")
 
 
-def npz_file(surface: BSplineSurface, trimmed: TrimmedSurface | None) -> bytes:
+def npz_bytes(surface: BSplineSurface, trimmed: TrimmedSurface | None) -> bytes:
     """Arrays of the surface and its loops, in their own precision."""
     arrays = {key: np.asarray(getattr(surface, key)) for key in _KEYS}
     arrays["order"] = np.asarray(surface.order)
@@ -29,7 +29,7 @@ def npz_file(surface: BSplineSurface, trimmed: TrimmedSurface | None) -> bytes:
     return buffer.getvalue()
 
 
-def json_file(surface: BSplineSurface, trimmed: TrimmedSurface | None) -> bytes:
+def json_bytes(surface: BSplineSurface, trimmed: TrimmedSurface | None) -> bytes:
     """The document that `geomdl.exchange.import_json` reads."""
     control_points, knots_u, knots_v = (np.asarray(getattr(surface, key)) for key in _KEYS)
     nu, nv, d = control_points.shape

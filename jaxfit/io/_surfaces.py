@@ -12,14 +12,14 @@ from jaxfit._fit import Fit
 from jaxfit._splines import BSplineSurface
 from jaxfit._trimmed import TrimmedSurface
 from jaxfit._trimmed._trimmed_surface import host_loops
-from jaxfit.io._cad import iges_file, step_file
+from jaxfit.io._cad import iges_bytes, step_bytes
 from jaxfit.io._nets import clamped_net, near_origin
 from jaxfit.io._output import check_output, write_atomically
 from jaxfit.io._point_data import InputError
 from jaxfit.io._points import check_input
-from jaxfit.io._rhino import rhino_file
-from jaxfit.io._stored import json_file, npz_file, stored_surface
-from jaxfit.io._tessellation import mesh_file, tessellate
+from jaxfit.io._rhino import rhino_bytes
+from jaxfit.io._stored import json_bytes, npz_bytes, stored_surface
+from jaxfit.io._tessellation import mesh_bytes, tessellate
 
 # What a parser raises on damaged files, and what a surface that is none raises.
 _DAMAGED = (ValueError, TypeError, LookupError, AttributeError, RecursionError)
@@ -108,25 +108,25 @@ def _content(path: Path, surface: BSplineSurface, trimmed: TrimmedSurface | None
     """The bytes of the file, and the offset that was subtracted."""
     suffix, nowhere = path.suffix.lower(), np.zeros(surface.dimension)
     if suffix == ".npz":
-        return npz_file(surface, trimmed), nowhere
+        return npz_bytes(surface, trimmed), nowhere
     if suffix == ".json":
-        return json_file(surface, trimmed), nowhere
+        return json_bytes(surface, trimmed), nowhere
     net = clamped_net(surface)
     loops = [] if trimmed is None else host_loops(trimmed)
     if suffix == ".3dm":
-        return rhino_file(net, loops, path.stem), nowhere
+        return rhino_bytes(net, loops, path.stem), nowhere
     centred, offset = near_origin(net)
     note = "written by jaxfit"
     if offset.any():
         note += "; add to coordinates: " + " ".join(map(repr, offset.tolist()))
     if suffix in (".step", ".stp"):
-        return step_file(centred, loops, path.stem, note), offset
+        return step_bytes(centred, loops, path.stem, note), offset
     if suffix in (".iges", ".igs"):
-        return iges_file(centred, loops, path.stem, note), offset
+        return iges_bytes(centred, loops, path.stem, note), offset
     if trimmed is None:
-        return mesh_file(*tessellate(centred), suffix, note), offset
+        return mesh_bytes(*tessellate(centred), suffix, note), offset
     vertices, triangles, *_ = trimmed.tessellate()
-    return mesh_file(vertices - offset, triangles, suffix, note), offset
+    return mesh_bytes(vertices - offset, triangles, suffix, note), offset
 
 
 def read_surface(path: str | os.PathLike) -> BSplineSurface | TrimmedSurface:

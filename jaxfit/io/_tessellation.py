@@ -17,7 +17,7 @@ Vertices = Float[np.ndarray, "vertices 3"]
 Triangles = Int[np.ndarray, "triangles 3"]
 
 
-def mesh_file(vertices: Vertices, triangles: Triangles, suffix: str, note: str) -> bytes:
+def mesh_bytes(vertices: Vertices, triangles: Triangles, suffix: str, note: str) -> bytes:
     """Triangles in a .ply, .stl or .obj file.
 
     Raises

@@ -1,4 +1,4 @@
-"""`Stationarity`: what a method says about the surfaces that it comes to rest at."""
+"""`StationarityCondition`: what a method says about the surfaces that it comes to rest at."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from jaxfit._normal_equations import AbstractPenalty
 
 
-class Stationarity(eqx.Module):
+class StationarityCondition(eqx.Module):
     r"""The condition that a method's final surface meets, from which the derivative of its fits follows.
 
     With the foot $(u_k, v_k)$ and the residual $r_k = R(u_k, v_k) - Q_k$ of every point, for every control
@@ -32,7 +32,7 @@ class Stationarity(eqx.Module):
 
     Examples
     --------
-    >>> at_rest = jf.Stationarity(weight=np.ones(5), held=np.zeros((4, 4), bool))
+    >>> at_rest = jf.StationarityCondition(weight=np.ones(5), held=np.zeros((4, 4), bool))
     >>> at_rest.penalty is None
     True
     """

@@ -10,7 +10,7 @@ from jaxfit._scan._manifold import Faces, boundary_loops, directed_edges, perime
 MOST_CORNERS = 40  # of a gap
 
 
-def filled_holes(points: Float[Any, "points 3"], faces: Faces, length: float) -> Faces:
+def with_gaps_closed(points: Float[Any, "points 3"], faces: Faces, length: float) -> Faces:
     """With triangles over every gap that can be closed without an edge longer than `length`.
 
     The longest loop is the rim and stays.

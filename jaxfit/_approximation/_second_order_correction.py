@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxfit._approximation._foot_tangents import FootTangents
+from jaxfit._approximation._free_tangents import FreeTangents
 from jaxfit._barrier import materialise
 from jaxfit._cells import (
     Jet,
@@ -25,9 +25,9 @@ from jaxfit._cells import (
     evaluate_first_order,
     evaluate_jet,
     local_coordinates,
-    over_blocks,
     row_coefficients,
     row_moments,
+    sum_over_blocks,
 )
 from jaxfit._closest import dot
 from jaxfit._splines._pieces import Pieces
@@ -60,7 +60,7 @@ def second_order_rhs(
         return total.at[part.cell].add(row_moments(s, t, second, order_u, order_v))
 
     begin = jnp.zeros((pieces.cells, order_u, order_v * d), u.dtype)
-    total = over_blocks(rows, add, begin)
+    total = sum_over_blocks(rows, add, begin)
     return cells_to_net(total, pieces.axis_u.polynomials, pieces.axis_v.polynomials)
 
 
@@ -75,7 +75,7 @@ def _second_derivative_at(
     coefficients = row_coefficients(moves, part)
     value, value_s, value_t = materialise(always, evaluate_first_order, coefficients, s, t)
     e = target - jet.value
-    free = FootTangents.at(pieces, u, v, e, jet.s, jet.t)
+    free = FreeTangents.at(pieces, u, v, e, jet.s, jet.t)
     along = free.coordinates(value)
     right = (dot(e, value_s) - dot(jet.s, value), dot(e, value_t) - dot(jet.t, value))
     slide, valid = _slide(free, e, jet, along, right)
@@ -86,7 +86,7 @@ def _second_derivative_at(
 
 
 def _slide(
-    free: FootTangents, e: Array, jet: Jet, along: tuple[Array, Array], right: tuple[Array, Array]
+    free: FreeTangents, e: Array, jet: Jet, along: tuple[Array, Array], right: tuple[Array, Array]
 ) -> tuple[tuple[Array, Array], Array]:
     """The moves of the feet, and whether these are valid: near the surface, by its radii of curvature.
 

@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 
-def smoothed(moves: Float[Any, "a b d"], sure: Float[Any, "a b"], stiffness: float) -> Float[Any, "a b d"]:
+def smoothed_displacements(
+    moves: Float[Any, "a b d"], sure: Float[Any, "a b"], stiffness: float
+) -> Float[Any, "a b d"]:
     r"""The displacements D, zero on the border, that minimise
 
     $$\sum_{ij} c_{ij} |D_{ij} - T_{ij}|^2

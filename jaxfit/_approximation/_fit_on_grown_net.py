@@ -30,7 +30,7 @@ def fit_everywhere(fit: Callable[[dict[str, Any]], Fit], request: dict[str, Any]
     return converged_or_raise(found) if throw else found
 
 
-def fit_growing(growth: NetGrowth) -> Fit:
+def fit_on_grown_net(growth: NetGrowth) -> Fit:
     """The fit with a net of the size that the tolerances take, or that the points allow."""
     level, why = growth.grown()
     level = growth.afresh(level)

@@ -10,7 +10,7 @@ from jaxfit._base._douglas_peucker import chord_lengths
 SAMPLES = 64  # of a side curve, per control point
 
 
-def along_sides(
+def parameters_at_arc_length(
     places: Float[Any, "points 2"],
     net: Float[Any, "nu nv d"],
     knots: tuple[Float[Any, " knots_u"], Float[Any, " knots_v"]],

@@ -1,4 +1,4 @@
-"""`FootTangents`: the tangent directions in which a foot is free to move, and projection off them."""
+"""`FreeTangents`: the tangent directions in which a foot is free to move, and projection off them."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from jaxfit._splines._pieces import Pieces
 PARALLEL = 1e-12  # squared sines of smaller angles between the tangents count as none
 
 
-class FootTangents(NamedTuple):
+class FreeTangents(NamedTuple):
     """An orthogonal basis: R_u, and the part of R_v orthogonal to it, each 0 where it is not free.
 
     At a foot on the border a direction is free unless the residual points out of the domain. Of parallel
@@ -28,7 +28,7 @@ class FootTangents(NamedTuple):
     per_second: Float[Array, "..."]
 
     @staticmethod
-    def at(pieces: Pieces, u: Array, v: Array, e: Array, s: Array, t: Array) -> "FootTangents":
+    def at(pieces: Pieces, u: Array, v: Array, e: Array, s: Array, t: Array) -> "FreeTangents":
         """At feet (u, v) with residuals `e` and tangents `s` along u and `t` along v."""
         s = jnp.where(_held(pieces.axis_u, u, e, s)[None], 0.0, s)
         t = jnp.where(_held(pieces.axis_v, v, e, t)[None], 0.0, t)
@@ -39,7 +39,7 @@ class FootTangents(NamedTuple):
         square = dot(across, across)
         counts = square > PARALLEL * G
         per_second = jnp.where(counts, 1.0 / jnp.where(counts, square, 1.0), 0.0)
-        return FootTangents(s, across, share, per_first, per_second)
+        return FreeTangents(s, across, share, per_first, per_second)
 
     def entries(self) -> Float[Array, "pairs ..."]:
         """The projection I - Pi on these directions, its entries on and above the diagonal."""

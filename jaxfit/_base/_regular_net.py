@@ -12,7 +12,7 @@ FARTHEST = 2.0  # times the reach of the points: how far out control points may 
 MOST_RISES = 12  # most rises of the smoothing
 
 
-def smoothed_net(fit: ThinPlateFit, smoothing: float, robust: int, reach: float) -> Float[Any, "nu nv d"]:
+def regular_net(fit: ThinPlateFit, smoothing: float, robust: int, reach: float) -> Float[Any, "nu nv d"]:
     """The net with this smoothing, or ten times more until no control point lies far out; then unfolded.
 
     `reach` is how far out the points are, `robust` in how many rounds they lose weight with their distance.

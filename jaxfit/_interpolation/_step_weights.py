@@ -10,7 +10,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._compile import compiled
-from jaxfit._interpolation._point_collocation import PointCollocation, basis_at
+from jaxfit._interpolation._per_point_collocation import PointCollocation, basis_at
 from jaxfit._splines._pieces import Axis
 
 POWER_ITERATIONS = 100

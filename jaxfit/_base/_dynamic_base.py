@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jaxfit._base._base_method import AbstractBaseMethod
 from jaxfit._base._directed_projection import directed_projection, mean_distance, reach_of
-from jaxfit._base._grid_smoothing import smoothed
+from jaxfit._base._displacement_smoothing import smoothed_displacements
 from jaxfit._base._host_splines import GridEvaluator, Knots, along_both, basis_matrix
 from jaxfit._base._normalised_cloud import Cloud, thinned
 from jaxfit._checks import check_number
@@ -135,7 +135,7 @@ class DynamicBaseSurface(AbstractBaseMethod):
                 grid.reshape(-1, 3), normals.reshape(-1, 3), reach.ravel(), points
             )
             moved = grid - level.base + moves.reshape(reach.shape)[..., None] * normals
-            net = level.interpolated(smoothed(moved, sure.reshape(reach.shape), self.stiffness))
+            net = level.interpolated(smoothed_displacements(moved, sure.reshape(reach.shape), self.stiffness))
             distance = mean_distance(net, level.knots, level.order, points)
             fell = distance < least * (1 - LEAST_GAIN)
             if distance < least:

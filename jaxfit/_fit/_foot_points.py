@@ -1,4 +1,4 @@
-"""`Projection`: the feet of all points on a surface, and the errors there."""
+"""`FootPoints`: the feet of all points on a surface, and the errors there."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Bool, Float, Int
 
 
-class Projection(eqx.Module):
+class FootPoints(eqx.Module):
     """Foot points of all points on a surface, and the errors there.
 
     Attributes
@@ -31,7 +31,7 @@ class Projection(eqx.Module):
     Examples
     --------
     >>> u, none = jnp.array([0.25, 0.5]), jnp.zeros(2, jnp.int32)
-    >>> projection = jf.Projection(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
+    >>> projection = jf.FootPoints(u, u, jnp.zeros(2), none, none == 0, jnp.asarray(2), jnp.asarray(True))
     >>> projection.u.shape, int(projection.active), bool(projection.converged.all())
     ((2,), 2, True)
     """

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxfit._approximation._least_squares import LeastSquaresProblem
+from jaxfit._approximation._linear_least_squares import LeastSquaresProblem
 from jaxfit._normal_equations import normal_solver
 from jaxfit._unrolling import constant
 

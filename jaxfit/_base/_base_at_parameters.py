@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base._host_splines import Knots
-from jaxfit._base._smoothed_net import smoothed_net
+from jaxfit._base._regular_net import regular_net
 from jaxfit._base._thin_plate_fit import ThinPlateFit
 from jaxfit._precision import working_dtype
 from jaxfit._splines import BSplineSurface
@@ -15,7 +15,7 @@ SMOOTHING = 0.1  # as `Meshless` has it: details about as wide as a knot span ar
 ROBUST = 3  # rounds in which far points lose weight
 
 
-def free_base(
+def base_at_parameters(
     points: Float[Any, "points d"],
     parameters: Float[Any, "points 2"],
     knots: Knots,
@@ -32,6 +32,6 @@ def free_base(
     start = np.zeros((*net, points.shape[1]))
     fit = ThinPlateFit(start, knots, order, parameters, middle / size, free_border=True)
     reach = float(np.linalg.norm(middle, axis=1).max()) / size
-    found = smoothed_net(fit, SMOOTHING, ROBUST, reach) * size + centre
+    found = regular_net(fit, SMOOTHING, ROBUST, reach) * size + centre
     dtype = working_dtype()
     return BSplineSurface(found.astype(dtype), *(x.astype(dtype) for x in knots))

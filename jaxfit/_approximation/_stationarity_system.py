@@ -28,7 +28,7 @@ WORST = 1e-4  # the residual that a derivative may leave
 DAMPING = 1e-3
 
 
-class NewtonSystem(eqx.Module):
+class StationaritySystem(eqx.Module):
     """What is known about the derivative of G: a preconditioner, and the control points that G determines.
 
     `fixed` is the normal matrix at fixed parameters. All are symmetric and serve the transposed system, too.
@@ -64,7 +64,7 @@ class NewtonSystem(eqx.Module):
         return jax.lax.custom_linear_solve(apply, right, solve=solve, transpose_solve=solve)
 
 
-def newton_system(
+def stationarity_system(
     method: AbstractIterativeMethod,
     state: Any,
     surface: WorkingSurface,
@@ -73,7 +73,7 @@ def newton_system(
     feet: tuple[Array, Array],
     error: Float[Array, " points"],
     shift: Any = 0.0,
-) -> NewtonSystem:
+) -> StationaritySystem:
     """With the factors of the Gauss-Newton matrix, whose rows are blended with those at fixed parameters.
 
     `rows` hold the points at their feet.
@@ -90,4 +90,4 @@ def newton_system(
         matrix, fixed = matrix.plus(stiffness), fixed.plus(stiffness)
         between = between.plus(stiffness)
     free = free_points(fixed, condition.held)
-    return NewtonSystem(coupled_preconditioner(matrix, between, free), fixed, free)
+    return StationaritySystem(coupled_preconditioner(matrix, between, free), fixed, free)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import count_compilations
 
-from jaxfit._linear_program import linear_call, transpose_ahead
+from jaxfit._linear_call import linear_call, transpose_ahead
 
 MATRIX = np.arange(12.0).reshape(3, 4)
 KNOWN = {"matrix": MATRIX, "factor": np.asarray(2.0)}

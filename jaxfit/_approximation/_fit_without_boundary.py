@@ -11,7 +11,7 @@ from jaxfit._approximation._approximate import default_method
 from jaxfit._approximation._checked_scan import ScanInput
 from jaxfit._approximation._cloud_fit import fit_cloud
 from jaxfit._approximation._errors import GlobalFeet, LocalFeet
-from jaxfit._approximation._fit_growing import fit_everywhere, fit_growing
+from jaxfit._approximation._fit_on_grown_net import fit_everywhere, fit_on_grown_net
 from jaxfit._approximation._growing_net import NetGrowth
 from jaxfit._approximation._level_nets import SheetNets
 from jaxfit._base import MOST_CONTROL_POINTS, default_size
@@ -23,7 +23,7 @@ from jaxfit._trimmed import TrimmedSurface
 Order = tuple[int, int]
 
 
-def fit_scan(
+def fit_without_boundary(
     scan: ScanInput,
     net: tuple[int, int] | None,
     order: Order,
@@ -45,7 +45,7 @@ def fit_scan(
     cloud, nets, method = points[finite], SheetNets(sheet, order), default_method(method)
     if net is None and grows:
         growth = NetGrowth(cloud, nets, method, request, cleaned=True)
-        fit = fit_growing(growth)
+        fit = fit_on_grown_net(growth)
         net = fit.surface.shape
     else:
         net = nets.net(default_size(len(on_sheet)), MOST_CONTROL_POINTS) if net is None else net
