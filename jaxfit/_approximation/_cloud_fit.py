@@ -80,7 +80,7 @@ def fit_cloud(
     loop = begin(method, together, begun, u[order], v[order], max_steps if room is None else room.steps)
     first = _end(together, begun, loop, order, unit, begun)
     if implicit:
-        _prepare_derivative(values, together, loop, first, not is_concrete(given))
+        _prepare_derivative(values, first, not is_concrete(given))
     if unrolled:
         loop, stats, unit = unrolled_fit(first, max_steps, *given)
         cloud, base, method, concrete = *given[:3], is_concrete(given)
@@ -123,16 +123,14 @@ def _nearest(
     return nearest.u, nearest.v
 
 
-def _prepare_derivative(
-    values: Any, problem: Problem, loop: LoopState, first: EndOfFit, differentiated: bool
-) -> None:
+def _prepare_derivative(values: Any, first: EndOfFit, differentiated: bool) -> None:
     """Have a method that has no implicit derivative say so before the fit, which may take long, and begin to
     compile what brings the fit to rest; `first` is where it begins.
     """
     _, _, method, request = values
-    concrete = is_concrete(values, problem, loop)
+    concrete = is_concrete(values, first)
     if concrete or request["adjoint"] is not None:
-        check_derivative(method, problem, loop)
+        check_derivative(method, first.problem, first)
     if concrete:
         adjoint = request["adjoint"] or ImplicitAdjoint()
         polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values), differentiated)

@@ -28,6 +28,7 @@ from jaxfit._cells import Rows
 from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
+from jaxfit._compile_ahead import is_first
 from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._foot_points import FootPoints
@@ -164,6 +165,9 @@ def polish_ahead(
     """Begin to compile what brings a fit to rest, and the derivative there, all concrete; `end` is where the
     fit begins.
     """
+    leaves, tree = jax.tree.flatten((end, inputs))
+    if not is_first(rest, tree, tuple(map(jax.typeof, leaves)), differentiated_too):
+        return
     args = (rest, *_limits(adjoint, end), end, inputs)
     polished_fit.ahead(*args)
     if differentiated_too:

@@ -105,13 +105,12 @@ def compile_ahead(
     ):  # what a method of the user's can't do from there, it will say in `run`
         loop = begin(method, problem, surface, somewhere, somewhere, max_steps)
         if differentiated:
-            check_derivative(method, problem, loop)
+            check_derivative(method, problem, loop.current)
         _advance.ahead(*static_and_numbers(method), problem, problem.tolerances.max_steps, loop)
 
 
-def check_derivative(method: AbstractIterativeMethod, problem: Problem, loop: LoopState) -> None:
-    """Have a method that has no implicit derivative say so."""
-    here = loop.current
+def check_derivative(method: AbstractIterativeMethod, problem: Problem, here: Any) -> None:
+    """Have a method that has no implicit derivative say so; `here` is an iterate, or the end of a fit."""
     jax.eval_shape(method.stationarity, problem, here.surface, here.state, here.projection.error)
 
 
