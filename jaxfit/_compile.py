@@ -16,6 +16,7 @@ from jaxfit._kept_programs import call_kept
 OLDER_EMITTER = {"xla_cpu_use_fusion_emitters": False}  # other devices ignore it
 # Level 1 of 3 saves another 10 to 15 % of what compiling takes, for kernels that run 2 to 4 % longer.
 LEVEL = {"xla_backend_optimization_level": 1}
+NO_LEVEL = {"xla_backend_optimization_level": 0}
 # Into so many parts, which threads share, a module is cut; 32, as by default, take more time in all.
 PARTS = {"xla_cpu_parallel_codegen_split_count": 8}
 # Where vectors are that wide, kernels take 4 to 8 % less time than with the 256 bits that LLVM prefers.
@@ -27,14 +28,16 @@ UNKNOWN = "No such compile option"
 
 
 @cache
-def _options() -> dict[str, Any]:
+def _options(optimised: bool) -> dict[str, Any]:
     """Those for CPUs only are for a session that has not told JAX to optimise nothing."""
     if jax.default_backend() == "cpu" and not jax.config.read("jax_disable_most_optimizations"):
-        return FOR_CPUS
+        return FOR_CPUS if optimised else FOR_CPUS | NO_LEVEL
     return OLDER_EMITTER
 
 
-def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: Any) -> "Compiled":
+def compiled(
+    function: Callable[..., Any], kept: bool = False, optimised: bool = True, **jit_options: Any
+) -> "Compiled":
     """`jax.jit(function, **jit_options)` with options quick to compile, where JAX and XLA allow them.
 
     JAX takes compiler options for outermost programs only, so a call with traced arguments is an ordinary
@@ -42,25 +45,29 @@ def compiled(function: Callable[..., Any], kept: bool = False, **jit_options: An
     the call is computed at once, whatever is traced around it.
 
     What takes long to trace is `kept`: if programs are kept on disk, it is loaded from there. It has no
-    keyword arguments, and its static ones, in `static_argnums`, are the first.
+    keyword arguments, and its static ones, in `static_argnums`, are the first. What takes little time to run
+    need not be `optimised`.
     """
-    return Compiled(function, kept, jit_options)
+    return Compiled(function, kept, optimised, jit_options)
 
 
 class Compiled:
     """What `compiled` returns."""
 
-    def __init__(self, function: Callable[..., Any], kept: bool, jit_options: dict[str, Any]):
+    def __init__(
+        self, function: Callable[..., Any], kept: bool, optimised: bool, jit_options: dict[str, Any]
+    ):
         update_wrapper(self, function)
         self._function = function
         self._plain = jax.jit(function, **jit_options)
-        self._kept, self._jit_options = kept, jit_options
+        self._kept, self._optimised, self._jit_options = kept, optimised, jit_options
         self._static = np.size(jit_options.get("static_argnums", ()))
         self._options_known = True  # until XLA says that it does not know one
 
     @cached_property
     def _quick(self) -> Any:  # made by the first call, when JAX knows its devices
-        return jax.jit(self._function, **self._jit_options, compiler_options=_options())
+        options = _options(self._optimised)
+        return jax.jit(self._function, **self._jit_options, compiler_options=options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         if not self._options_known or not is_concrete(args, kwargs):

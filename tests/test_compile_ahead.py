@@ -48,7 +48,7 @@ def test_what_goes_wrong_in_the_thread_is_raised_by_the_call():
 
 
 def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
-    monkeypatch.setattr(_compile, "_options", lambda: {"xla_of_another_world": True})
+    monkeypatch.setattr(_compile, "_options", lambda _: {"xla_of_another_world": True})
     program = compiled(made_of, kept=True)
     program.ahead(X, 1.0)
     assert float(program(X, 1.0)) == pytest.approx(np.sin(X) @ np.cos(X))
@@ -63,7 +63,7 @@ CALLS = {
     "a grid": lambda: jf.interpolate(wavy_grid(13, 5), order=(3, 4)),
     "Chebyshev": lambda: jf.interpolate(wavy_grid(5, 13), CHEBYSHEV),
 }
-LARGE = ("_advance", "_run", "polished_fit", "_linearised", "_program")
+LARGE = ("_advance", "_advanced", "_run", "linearisation", "_along_inputs", "_program")
 
 
 @pytest.mark.parametrize("name", slow_except(CALLS, "a net given", "a grid"))

@@ -11,11 +11,10 @@ from jax.typing import ArrayLike
 from jaxfit._approximation._beyond_border import points_beyond_border
 from jaxfit._approximation._checked_arguments import checked_request
 from jaxfit._approximation._errors import AbstractErrors, Feet, GlobalFeet
+from jaxfit._approximation._fit_inputs import EndOfFit, FitInputs
 from jaxfit._approximation._implicit_fit import (
-    EndOfFit,
-    FitInputs,
     Fitted,
-    polish_ahead,
+    derivative_ahead,
     polished_fitted,
     with_implicit_derivative,
 )
@@ -133,7 +132,7 @@ def _prepare_derivative(values: Any, first: EndOfFit, differentiated: bool) -> N
         check_derivative(method, first.problem, first)
     if concrete:
         adjoint = request["adjoint"] or ImplicitAdjoint()
-        polish_ahead(static_fields(method), adjoint, first, FitInputs.of(*values), differentiated)
+        derivative_ahead(static_fields(method), adjoint, first, FitInputs.of(*values), differentiated)
 
 
 def _end(

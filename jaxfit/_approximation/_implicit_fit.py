@@ -15,32 +15,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxfit._approximation._polish import PolishedFit, polished
+from jaxfit._approximation._fit_inputs import (
+    EndOfFit,
+    FitInputs,
+    base_net_of,
+    given_feet_of,
+    problem_of,
+)
+from jaxfit._approximation._linearisation import Linearisation
+from jaxfit._approximation._polish import Polish, PolishedFit, polish_ahead, polished
 from jaxfit._approximation._stationarity_residual import (
+    FeetInRows,
     StationarityResidual,
-    feet_in_rows,
+    feet_at,
     stationarity_residual,
 )
-from jaxfit._approximation._stationarity_system import StationaritySystem
 from jaxfit._cells import Rows
 from jaxfit._checks import is_concrete
-from jaxfit._closest import as_feet
 from jaxfit._compile import compiled
 from jaxfit._compile_ahead import is_first
 from jaxfit._differentiable_once import differentiated
 from jaxfit._fit._adjoints import ImplicitAdjoint
-from jaxfit._fit._foot_points import FootPoints
-from jaxfit._fit._method import dynamic_fields
-from jaxfit._fit._problem import Problem
-from jaxfit._fit._scaling import Unit
-from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._linear_call import linear_call, transpose_ahead
-from jaxfit._precision import default_foot_tolerance, working_dtype
-from jaxfit._splines import BSplineSurface
-from jaxfit._splines._insertion import insertion_weights
-from jaxfit._splines._lookup import windows
 
 # Relative accuracy of the linear system of a derivative, in roots of the rounding unit.
 ACCURACY = 0.75
@@ -48,48 +46,7 @@ TRUSTED = 1e-3  # a greater |G|, relative to its terms, is of no surface near re
 RELIABLE = 1e-6  # and from this one on digits are lost
 
 LinearMap = Callable[[Any], tuple[Array, "Fitted"]]
-Residual = Callable[[Array, "FitInputs"], tuple[Array, "Fitted"]]
-
-
-class FitInputs(eqx.Module):
-    """What a fit is differentiated with respect to, in the user's unit; `numbers` are those of the method."""
-
-    points: Float[Array, "points d"]
-    weights: Float[Array, " points"] | None
-    numbers: Any
-    control_points: Float[Array, "nu nv d"]
-    start: tuple[Array, Array] | None
-
-    @staticmethod
-    def of(cloud: Any, base: BSplineSurface, method: Any, request: dict[str, Any]) -> "FitInputs":
-        """Of the arguments of `approximate`, in the working precision."""
-        dtype = working_dtype()
-        numbers, _ = dynamic_fields(method)
-        numbers = jax.tree.map(
-            lambda x: jnp.asarray(x, dtype) if is_concrete(x) else x.astype(dtype), numbers
-        )
-        weights, start = request["weights"], request["start"]
-        return FitInputs(
-            jnp.asarray(cloud, dtype),
-            None if weights is None else jnp.asarray(weights, dtype),
-            numbers,
-            jnp.asarray(base.control_points, dtype),
-            None if start is None else (jnp.asarray(start[0], dtype), jnp.asarray(start[1], dtype)),
-        )
-
-
-class EndOfFit(eqx.Module):
-    """Where a fit ended, or for `UnrolledAdjoint` where it is about to begin: in the unit of the problem, its
-    points indexed by `order`.
-    """
-
-    problem: Problem
-    surface: WorkingSurface
-    state: Any
-    projection: FootPoints
-    order: Int[Any, " points"]
-    unit: Unit
-    knots: tuple[Any, Any]  # of the base surface
+Residual = Callable[[FitInputs], tuple[Array, "Fitted"]]
 
 
 class Fitted(eqx.Module):
@@ -119,7 +76,7 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return jax.jvp(partial(_fitted_at_rest, rest, at_rest, end), (inputs,), (_with_zeros(tangents[2]),))
+    return _fitted_and_change(rest, at_rest, end, inputs, tangents[2])
 
 
 def _with_zeros(tangents: Any) -> Any:
@@ -159,7 +116,7 @@ def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: 
     return _fitted_at_rest(rest, at_rest, end, inputs)
 
 
-def polish_ahead(
+def derivative_ahead(
     rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs, differentiated_too: bool
 ) -> None:
     """Begin to compile what brings a fit to rest, and the derivative there, all concrete; `end` is where the
@@ -168,165 +125,135 @@ def polish_ahead(
     leaves, tree = jax.tree.flatten((end, inputs))
     if not is_first(rest, tree, tuple(map(jax.typeof, leaves)), differentiated_too):
         return
-    args = (rest, *_limits(adjoint, end), end, inputs)
-    polished_fit.ahead(*args)
+    at_rest = polish_ahead(rest, _polish_of(adjoint, end, inputs))
     if differentiated_too:
-        at_rest = polished_fit.like_result(*args)
-        _linearised.ahead(rest, at_rest, end, inputs)
-        fitted, maps = _linearised.like_result(rest, at_rest, end, inputs)
-        transpose_ahead(_along, (maps, at_rest.system), inputs, fitted)
+        args = rest, _place(at_rest), end, inputs
+        _along_inputs.ahead(*args)
+        fitted, along, places = _along_inputs.like_result(*args)
+        transpose_ahead(_along, (along, places, at_rest.near), inputs, fitted)
 
 
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
-    """`polished_fit` with the numbers of the adjoint: other ones compile nothing."""
-    return polished_fit(rest, *_limits(adjoint, end), end, lax.stop_gradient(inputs))
+    return polished(rest, _polish_of(adjoint, end, lax.stop_gradient(inputs)))
 
 
-def _limits(adjoint: ImplicitAdjoint, end: EndOfFit) -> tuple[np.ndarray, np.ndarray]:
-    """The stationarity to reach, and how many Newton steps may be taken."""
+def _polish_of(adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Polish:
+    """With the numbers of the adjoint as arrays: other ones compile nothing."""
     dtype = end.problem.target.dtype
-    return np.asarray(adjoint.goal(dtype), dtype), np.asarray(adjoint.polish_steps, np.int32)
+    goal, most = np.asarray(adjoint.goal(dtype), dtype), np.asarray(adjoint.polish_steps, np.int32)
+    return Polish(inputs.numbers, goal, most, end.problem, end.surface, end.state, end.projection)
 
 
-@partial(compiled, kept=True, static_argnums=0)
-def polished_fit(rest: Any, goal: Array, most: Array, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
-    """`polished`; on a CPU the fits of a batch one after the other."""
+class _Place(eqx.Module):
+    """Where a fit is at rest: what its derivative needs to know of that."""
 
-    def whole(goal: Array, most: Array, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
-        method = eqx.combine(inputs.numbers, rest)
-        return polished(method, goal, most, end.problem, end.surface, end.state, end.projection)
+    net: Float[Any, "nu nv d"]
+    u: Float[Any, " points"]
+    v: Float[Any, " points"]
+    feet: FeetInRows
+    free: Bool[Any, "nu nv"]
+    stationarity: Float[Any, ""]
 
-    if jax.default_backend() == "cpu":
-        whole = jax.custom_batching.sequential_vmap(whole)
-    return whole(goal, most, end, inputs)
+
+def _place(at_rest: PolishedFit) -> _Place:
+    here, near = at_rest.projection, at_rest.near
+    return _Place(at_rest.net, here.u, here.v, near.feet, near.system.free, at_rest.stationarity)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit as a function of the inputs."""
-    return _fitted(rest, at_rest, end, inputs)
+    return _fitted(rest, _place(at_rest), end, inputs)
 
 
 @partial(_fitted_at_rest.defjvp, symbolic_zeros=True)
 def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
-    fitted, maps = _linearised(rest, at_rest, end, differentiated(inputs))
-    return fitted, linear_call(_along, (maps, at_rest.system), _with_zeros(tangents[2]), fitted)
+    return _fitted_and_change(rest, at_rest, end, inputs, tangents[2])
+
+
+def _fitted_and_change(
+    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs, tangents: Any
+) -> tuple[Fitted, Fitted]:
+    """The polished fit, and its derivative along a change of the inputs."""
+    fitted, along, places = _along_inputs(rest, _place(at_rest), end, differentiated(inputs))
+    known = along, places, at_rest.near
+    return fitted, linear_call(_along, known, _with_zeros(tangents), fitted)
 
 
 @partial(compiled, kept=True, static_argnums=0)
-def _fitted(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
+def _fitted(rest: Any, place: _Place, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit."""
-    return _residual_at_rest(rest, at_rest, end)(at_rest.net, inputs)[1]
+    return _residual_at_rest(rest, place, end)(inputs)[1]
 
 
-@partial(compiled, static_argnums=0)
-def _linearised(
-    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs
-) -> tuple[Fitted, tuple[LinearMap, LinearMap]]:
-    """The polished fit; and G with the fit as linear maps, of changes of the inputs and of the net.
-
-    All that the derivative needs of the points is computed here, once for both modes.
-    """
-    residual, net = _residual_at_rest(rest, at_rest, end), at_rest.net
-    (_, fitted), along_inputs = jax.linearize(partial(residual, net), inputs)
-    _, along_net = jax.linearize(lambda net: residual(net, inputs), net)
-    return fitted, (along_inputs, along_net)
+@partial(compiled, optimised=False, static_argnums=0)
+def _along_inputs(
+    rest: Any, place: _Place, end: EndOfFit, inputs: FitInputs
+) -> tuple[Fitted, LinearMap, "_Places"]:
+    """The polished fit; G with the fit as a linear map of changes of the inputs; and where points are."""
+    residual = _residual_at_rest(rest, place, end)
+    (_, fitted), along = jax.linearize(residual, inputs)
+    return fitted, along, _Places.of(end, place.feet.rows, inputs.points.shape[0])
 
 
-def _along(known: tuple[tuple[LinearMap, LinearMap], StationaritySystem], change: FitInputs) -> Fitted:
+def _along(known: tuple[LinearMap, "_Places", Linearisation], change: FitInputs) -> Fitted:
     """The derivative along a change of the inputs."""
-    (along_inputs, along_net), system = known
+    along_inputs, places, near = known
     right, held = along_inputs(change)
     accuracy = float(jnp.finfo(right.dtype).eps) ** ACCURACY
-    move = system.solved_differentiably(lambda x: along_net(x)[0], -right, accuracy)
-    return jax.tree.map(jnp.add, held, along_net(move)[1])
+    move = near.system.solved_differentiably(near.change, -right, accuracy)
+    count, scale = change.points.shape[0], places.scale
+    u, v, error = (places.by_point(x, count) for x in near.along_net(move)[1])
+    net, none = jnp.where(near.system.free[:, :, None], scale * move, 0.0), jnp.zeros_like(held.diagonal)
+    return jax.tree.map(jnp.add, held, Fitted(net, u, v, scale * error, none, none))
 
 
-def _residual_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit) -> Residual:
-    """G, and the fit, as functions of the net and the inputs."""
-    at_rest, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (at_rest, end)))
-    here, system = at_rest.projection, at_rest.system
-    surface = end.surface.moved_to(at_rest.net)
+class _Places(eqx.Module):
+    """The number of the point in each slot of the rows, and the unit of the fit."""
 
-    def residual(net: Array, inputs: FitInputs) -> tuple[Array, Fitted]:
+    number: Int[Any, "rows width"]
+    scale: Float[Any, ""]
+
+    @staticmethod
+    def of(end: EndOfFit, rows: Rows, count: int) -> "_Places":
+        """Empty slots have the number `count`."""
+        number = jnp.asarray(end.order)[jnp.minimum(rows.point, end.order.shape[0] - 1)]
+        scale = jnp.asarray(end.unit.scale, end.problem.target.dtype)
+        return _Places(jnp.where(rows.filled, number, count), scale)
+
+    def by_point(self, x: Float[Array, "rows width"], count: int) -> Float[Array, " points"]:
+        """In the order of the points as they were given."""
+        return jnp.zeros(count, x.dtype).at[self.number].add(x, mode="drop")
+
+
+def _residual_at_rest(rest: Any, place: _Place, end: EndOfFit) -> Residual:
+    """G, and the fit, as functions of the inputs."""
+    place, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (place, end)))
+    surface = end.surface.moved_to(place.net)
+
+    def residual(inputs: FitInputs) -> tuple[Array, Fitted]:
         method = eqx.combine(inputs.numbers, rest)
         problem, still = problem_of(end, inputs), base_net_of(end, inputs)
-        u, v = (here.u, here.v) if method.finds_feet else given_feet_of(end, inputs)
-        feet = feet_in_rows(surface, end.problem, u, v)
-        args = (method, end.state, end.surface.moved_to(net), problem, feet)
-        found = stationarity_residual(*args, system.free, still)
-        return found.value, _outward(end, inputs, at_rest, net, found, feet.rows)
+        feet = place.feet
+        if not method.finds_feet:
+            feet = feet_at(surface, feet.rows, *given_feet_of(end, inputs))
+        found = stationarity_residual(method, end.state, surface, problem, feet, place.free, still)
+        return found.value, _outward(end, inputs, place, still, found)
 
     return residual
 
 
 def _outward(
-    end: EndOfFit,
-    inputs: FitInputs,
-    at_rest: PolishedFit,
-    net: Array,
-    found: StationarityResidual,
-    rows: Rows,
+    end: EndOfFit, inputs: FitInputs, place: _Place, still: Array, found: StationarityResidual
 ) -> Fitted:
     """In the user's unit and the order of the points."""
-    count, unit = inputs.points.shape[0], end.unit
-    number = end.order[jnp.minimum(rows.point, end.order.shape[0] - 1)]
-    number = jnp.where(rows.filled, number, count)
-
-    def by_point(x: Array) -> Array:
-        return jnp.zeros(count, x.dtype).at[number].set(x, mode="drop")
-
-    moved = net * unit.scale + unit.centre[None, None]
-    kept = base_net_of(end, inputs) * unit.scale + unit.centre[None, None]
-    if inputs.control_points.shape == net.shape:
-        kept = inputs.control_points.astype(net.dtype)  # to the last bit
-    net = jnp.where(at_rest.system.free[:, :, None], moved, kept)
-    error = by_point(found.error) * unit.scale
+    unit, count = end.unit, inputs.points.shape[0]
+    places = _Places.of(end, place.feet.rows, count)
+    moved, kept = (x * unit.scale + unit.centre[None, None] for x in (place.net, still))
+    if inputs.control_points.shape == kept.shape:
+        kept = inputs.control_points.astype(kept.dtype)  # to the last bit
+    net = jnp.where(place.free[:, :, None], moved, kept)
+    u, v, error = (places.by_point(x, count) for x in (found.u, found.v, found.error))
     diagonal = problem_of(end, inputs).diagonal * unit.scale
-    return Fitted(net, by_point(found.u), by_point(found.v), error, diagonal, at_rest.stationarity)
-
-
-def problem_of(end: EndOfFit, inputs: FitInputs) -> Problem:
-    """The problem as a function of the inputs. The diagonal follows the points; scale and centre need not."""
-    unit, problem = end.unit, end.problem
-    inner = (inputs.points - unit.centre[None]) / unit.scale
-    spare = end.order.shape[0] - inner.shape[0]
-    target = jnp.pad(inner.astype(problem.target.dtype).T, ((0, 0), (0, spare)), mode="edge")[:, end.order]
-    weight = problem.weight
-    if inputs.weights is not None:
-        weight = jnp.pad(inputs.weights.astype(weight.dtype), (0, spare))[end.order]
-    counted = (weight > 0)[None]
-    low, high = (
-        pick(jnp.where(counted, target, sign * jnp.inf), axis=1)
-        for pick, sign in ((jnp.min, 1.0), (jnp.max, -1.0))
-    )
-    diagonal = jnp.sqrt(jnp.sum((high - low) ** 2))
-    return eqx.tree_at(lambda p: (p.target, p.weight, p.diagonal), problem, (target, weight, diagonal))
-
-
-def base_net_of(end: EndOfFit, inputs: FitInputs) -> Float[Array, "nu nv d"]:
-    """The base surface on the knots of the final one, in the unit of the problem."""
-    net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
-    net = net.astype(end.surface.control_points.dtype)
-    if net.shape == end.surface.control_points.shape:
-        return net
-    for old, new in zip(end.knots, (end.surface.knots_u, end.surface.knots_v), strict=True):
-        first, weights = insertion_weights(old, new, old.shape[0] - net.shape[0])
-        near = windows(net, first, weights.shape[0])
-        moved = jnp.einsum("ri...,ri->i...", near, weights, precision=lax.Precision.HIGHEST)
-        net = jnp.swapaxes(moved, 0, 1)
-    return net
-
-
-def given_feet_of(end: EndOfFit, inputs: FitInputs) -> tuple[Array, Array]:
-    """The parameters that the fit was given, or those of the closest points on the base surface."""
-    feet = end.projection.u, end.projection.v
-    spare = end.order.shape[0] - inputs.points.shape[0]
-    if inputs.start is not None:
-        u, v = (jnp.pad(x, (0, spare), mode="edge")[end.order] for x in inputs.start)
-        return u.astype(feet[0].dtype), v.astype(feet[0].dtype)
-    problem = problem_of(end, inputs)
-    tolerance = default_foot_tolerance(feet[0].dtype) * problem.diagonal
-    net = (inputs.control_points - end.unit.centre[None, None]) / end.unit.scale
-    return as_feet(feet, (net, *end.knots), problem.target.T, tolerance)
+    return Fitted(net, u, v, error * unit.scale, diagonal, place.stationarity)

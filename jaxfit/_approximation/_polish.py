@@ -1,25 +1,24 @@
 """Newton steps on G, from the surface that a fit ended with to the one it would come to rest at."""
 
+import dataclasses
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._damping import longest_moves
-from jaxfit._approximation._stationarity_residual import (
-    FeetInRows,
-    feet_in_rows,
-    stationarity_residual,
-)
-from jaxfit._approximation._stationarity_system import StationaritySystem, stationarity_system
-from jaxfit._cells import distances_at
-from jaxfit._closest import Newton
-from jaxfit._fit._feet import measure_feet
+from jaxfit._approximation._linearisation import Linearisation, linearisation
+from jaxfit._approximation._stationarity_system import StationaritySystem
+from jaxfit._checks import is_concrete
+from jaxfit._closest import Newton, compile_search_ahead
+from jaxfit._compile import compiled
+from jaxfit._fit._feet import measure_feet, measure_feet_on_host
 from jaxfit._fit._foot_points import FootPoints
-from jaxfit._fit._method import AbstractIterativeMethod
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._precision import default_foot_tolerance
@@ -37,105 +36,177 @@ GROWTH = 4.0  # of |G| in an accepted step
 FAR, PATIENCE = 0.5, 10
 
 
-class PolishedFit(eqx.Module):
-    """The surface at rest, its feet, |G| over the norms of its terms, and the linear system there."""
+class Polish(eqx.Module):
+    """A fit that is to be brought to rest.
 
-    net: Float[Array, "nu nv d"]
+    `numbers` are the dynamic fields of its method. |G|, relative to its terms, should fall to `goal` in at
+    most so many steps.
+    """
+
+    numbers: Any
+    goal: Float[Any, ""]
+    most: Int[Any, ""]
+    problem: Problem
+    surface: WorkingSurface
+    state: Any
     projection: FootPoints
-    system: StationaritySystem
-    stationarity: Float[Array, ""]
+
+
+class PolishedFit(eqx.Module):
+    """The surface at rest, its feet, G near it, and |G| over the norms of its terms."""
+
+    net: Float[Any, "nu nv d"]
+    projection: FootPoints
+    near: Linearisation
+    stationarity: Float[Any, ""]
 
 
 class _Accepted(eqx.Module):
-    net: Float[Array, "nu nv d"]
+    net: Float[Any, "nu nv d"]
     projection: FootPoints
-    value: Float[Array, "nu nv d"]  # G
-    size: Float[Array, ""]  # its norm
-    terms: Float[Array, ""]
-    goal: Float[Array, ""]
+    value: Float[Any, "nu nv d"]  # G
+    size: Float[Any, ""]  # its norm
+    terms: Float[Any, ""]
+    goal: Float[Any, ""]
 
 
 class _State(eqx.Module):
     """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
 
     accepted: _Accepted
-    system: StationaritySystem  # at the accepted net
-    trial: Float[Array, "nu nv d"]
-    predicted: Float[Array, ""]
-    shift: Float[Array, ""]
-    steps: Int[Array, ""]
-    again: Bool[Array, ""]
-    begun: Bool[Array, ""]
-    done: Bool[Array, ""]
+    stationarity: Float[Any, ""]  # there
+    free: Bool[Any, "nu nv"]
+    trial: Float[Any, "nu nv d"]
+    predicted: Float[Any, ""]
+    shift: Float[Any, ""]
+    steps: Int[Any, ""]
+    again: Bool[Any, ""]
+    begun: Bool[Any, ""]
+    done: Bool[Any, ""]
 
 
-def polished(
-    method: AbstractIterativeMethod,
-    goal: Float[Array, ""],
-    most: Int[Array, ""],
-    problem: Problem,
-    surface: WorkingSurface,
-    state: Any,
-    projection: FootPoints,
-) -> PolishedFit:
+def polished(rest: Any, polish: Polish) -> PolishedFit:
     r"""Newton steps until G, relative to its terms, is below `goal`, or `most` steps, or nothing helps, or
-    the surface is still far from rest after a tenth of them.
+    the surface is still far from rest after a tenth of them. `rest` are the static fields of the method.
 
     A step solves $(G' + \mu M)\, \delta P = -G$, with the normal matrix M at fixed parameters. It is accepted
     where $(G_0 + G_1) \cdot \delta P < 0$. To third order that is twice the change of the objective of which
     G is the gradient, and it needs no such objective. mu is 0 unless steps are rejected.
+
+    Where all is concrete the host calls the programs of a step one by one: the derivative and the search for
+    closest points need them, too.
     """
-    problem, surface, state, projection = jax.tree.map(jnp.asarray, (problem, surface, state, projection))
-    still = surface.control_points
-
-    def found_at(
-        there: WorkingSurface, here: FootPoints, shift: Array
-    ) -> tuple[FeetInRows, StationaritySystem]:
-        places = here.u, here.v
-        feet = feet_in_rows(there, problem, *places)
-        return feet, stationarity_system(method, state, there, problem, feet.rows, places, here.error, shift)
-
-    def advance(now: _State) -> _State:
-        old, there = now.accepted, surface.moved_to(now.trial)
-        here = _measured(method, problem, there, old.projection)
-        feet, system = found_at(there, here, now.shift)
-        free = jnp.where(now.begun, now.system.free, system.free)  # the same for all steps
-        system = eqx.tree_at(lambda s: s.free, system, free)
-
-        def residual(net: Array) -> tuple[Array, Any]:
-            moved = surface.moved_to(net)
-            found = stationarity_residual(method, state, moved, problem, feet, free, still)
-            return found.value, (found.terms, jnp.maximum(goal * found.terms, found.rounding))
-
-        value, apply, (terms, least) = jax.linearize(residual, now.trial, has_aux=True)
-        new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), terms, least)
-        work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
-        good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
-        shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
-
-        def step() -> tuple[Array, Array]:
-            wanted = jnp.clip(LAST_ACCURACY * least / new.size, ACCURACY, LAST_ACCURACY)
-            solution, image = system.solved(apply, -value, shift, wanted, MOST_CYCLES)
-            share = _share_within_reach(surface.moved_to(now.trial), solution)
-            move = share * solution
-            return now.trial + move, jnp.sum(move * (value + 0.5 * share * image))
-
-        done = good & ((new.size <= least) | (now.steps >= most))
-        trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
-        new, system = jax.tree.map(lambda x, y: jnp.where(good, x, y), (new, system), (old, now.system))
-        far = (now.steps >= jnp.maximum(PATIENCE, most // 10)) & (new.size > FAR * new.terms)
-        ended = done | (shift > MOST_SHIFT) | far
-        return _State(new, system, trial, predicted, shift, now.steps + good, ~good, yes, ended)
-
-    nothing, yes = jnp.zeros((), still.dtype), jnp.asarray(True)
-    first = _Accepted(still, projection, jnp.zeros_like(still), nothing + jnp.inf, nothing, nothing)
-    unknown = jax.eval_shape(found_at, surface, projection, nothing)[1]
-    system = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unknown)
-    begin = _State(first, system, still, nothing, nothing, jnp.asarray(0, jnp.int32), yes, ~yes, ~yes)
-    last = lax.while_loop(lambda now: ~now.done, advance, begin)
+    if is_concrete(polish):
+        last, near = _at_rest_on_host(rest, polish)
+    else:
+        last, system = _at_rest_in_program(rest, polish)
+        near = eqx.tree_at(lambda x: x.system, _near(rest, polish, last), system)
     end = last.accepted
-    share = end.size / jnp.where(end.terms > 0, end.terms, 1.0)
-    return PolishedFit(end.net, end.projection, last.system, share)
+    return PolishedFit(end.net, end.projection, near, last.stationarity)
+
+
+def polish_ahead(rest: Any, polish: Polish) -> PolishedFit:
+    """Begin to compile what `polished` calls, all concrete; the like of what it returns."""
+    begin = _first_state(polish)
+    args = _at_trial(rest, polish, begin, polish.projection)
+    linearisation.ahead(*args)
+    near = linearisation.like_result(*args)
+    _advanced.ahead(polish.goal, polish.most, polish.surface, begin, near, polish.projection)
+    if _finds_feet(rest, polish):
+        surface, count = polish.surface, int(np.sum(polish.problem.real))
+        compile_search_ahead(Newton(), surface.control_points, *surface.axes, count)
+    return PolishedFit(begin.trial, polish.projection, near, polish.goal)
+
+
+@partial(jax.jit, static_argnums=0)
+def _at_rest_in_program(rest: Any, polish: Polish) -> tuple[_State, StationaritySystem]:
+    """The state at rest and the system there; on a CPU the fits of a batch one after the other."""
+
+    def whole(polish: Polish) -> tuple[_State, StationaritySystem]:
+        step = partial(_step, rest, polish)
+        last = lax.while_loop(lambda now: ~now.done, lambda now: step(now)[0], _first_state(polish))
+        return last, _near(rest, polish, last).system
+
+    if jax.default_backend() == "cpu":
+        whole = jax.custom_batching.sequential_vmap(whole)
+    return whole(polish)
+
+
+def _at_rest_on_host(rest: Any, polish: Polish) -> tuple[_State, Linearisation]:
+    now = _first_state(polish)
+    while True:
+        now, near = _step(rest, polish, now)
+        if now.done:
+            return now, _near(rest, polish, now) if now.again else near
+        del near  # before there is the next one
+
+
+def _first_state(polish: Polish) -> _State:
+    net = polish.surface.control_points
+    xp: Any = np if is_concrete(polish) else jnp  # NumPy's arrays cost no calls of their own
+    zero, yes = xp.zeros((), net.dtype), xp.ones((), bool)
+    begin = _Accepted(net, polish.projection, xp.zeros_like(net), zero + xp.inf, zero, zero)
+    free = xp.ones(net.shape[:2], bool)
+    return _State(begin, zero, free, net, zero, zero, xp.zeros((), np.int32), yes, ~yes, ~yes)
+
+
+def _step(rest: Any, polish: Polish, now: _State) -> tuple[_State, Linearisation]:
+    """The next state, and G near the trial of this one."""
+    here = now.accepted.projection
+    if _finds_feet(rest, polish):  # as converged as a derivative needs
+        there, tolerance = polish.surface.moved_to(now.trial), default_foot_tolerance(now.trial.dtype)
+        if is_concrete(polish):
+            here = measure_feet_on_host(Newton(), polish.problem, there, here, tolerance)
+        else:
+            here = measure_feet(Newton(), polish.problem, there.pieces, here, tolerance)
+    near = linearisation(*_at_trial(rest, polish, now, here))
+    return _advanced(polish.goal, polish.most, polish.surface, now, near, here), near
+
+
+def _finds_feet(rest: Any, polish: Polish) -> bool:
+    return eqx.combine(polish.numbers, rest).finds_feet
+
+
+def _at_trial(rest: Any, polish: Polish, now: _State, here: FootPoints) -> tuple[Any, ...]:
+    """The arguments of `linearisation` at the next net to try, whose feet are `here`."""
+    fit = polish.numbers, polish.problem, polish.surface, polish.state
+    return rest, *fit, now.trial, here, now.shift, now.free, now.begun
+
+
+def _near(rest: Any, polish: Polish, last: _State) -> Linearisation:
+    """At the net that was accepted last, without a shift."""
+    end, zero = last.accepted, np.zeros((), last.shift.dtype)
+    there = dataclasses.replace(last, trial=end.net, shift=zero)
+    return linearisation(*_at_trial(rest, polish, there, end.projection))
+
+
+@compiled
+def _advanced(
+    goal: Array, most: Array, surface: WorkingSurface, now: _State, near: Linearisation, here: FootPoints
+) -> _State:
+    """Whether the trial is accepted, and from the net that is, the next one to try."""
+    old, value = now.accepted, near.value
+    least = jnp.maximum(goal * near.terms, near.rounding)
+    new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), near.terms, least)
+    work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
+    good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
+    shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
+
+    def step() -> tuple[Array, Array]:
+        wanted = jnp.clip(LAST_ACCURACY * least / new.size, ACCURACY, LAST_ACCURACY)
+        solution, image = near.system.solved(near.change, -value, shift, wanted, MOST_CYCLES)
+        share = _share_within_reach(surface.moved_to(now.trial), solution)
+        move = share * solution
+        return now.trial + move, jnp.sum(move * (value + 0.5 * share * image))
+
+    done = good & ((new.size <= least) | (now.steps >= most))
+    trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
+    new = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
+    far = (now.steps >= jnp.maximum(PATIENCE, most // 10)) & (new.size > FAR * new.terms)
+    ended = done | (shift > MOST_SHIFT) | far
+    yes, free = jnp.asarray(True), near.system.free
+    share = new.size / jnp.where(new.terms > 0, new.terms, 1.0)
+    return _State(new, share, free, trial, predicted, shift, now.steps + good, ~good, yes, ended)
 
 
 def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:
@@ -154,14 +225,3 @@ def _share_within_reach(surface: WorkingSurface, move: Float[Array, "nu nv d"]) 
     length = jnp.sqrt(jnp.sum(move**2, axis=-1))
     longest = longest_moves(surface.control_points, REACH, surface.used)
     return jnp.min(jnp.where(length > longest, longest / jnp.where(length > 0, length, 1.0), 1.0))
-
-
-def _measured(
-    method: AbstractIterativeMethod, problem: Problem, surface: WorkingSurface, before: FootPoints
-) -> FootPoints:
-    """Feet, converged as far as a derivative needs, or without feet the errors at the parameters."""
-    if method.finds_feet:
-        tolerance = default_foot_tolerance(problem.target.dtype)
-        return measure_feet(Newton(), problem, surface.pieces, before, tolerance)
-    distance = distances_at(surface.pieces, before.u, before.v, problem.target, problem.real)
-    return eqx.tree_at(lambda p: p.error, before, distance)

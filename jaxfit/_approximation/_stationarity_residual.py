@@ -65,7 +65,12 @@ def feet_in_rows(surface: WorkingSurface, problem: Problem, u: Array, v: Array) 
     """All real points, those of weight 0 too, for the derivative with respect to their weight."""
     pieces = jax.tree.map(jnp.asarray, surface.pieces)
     width = row_width(u.shape[0], pieces.cells)
-    rows = rows_of(pieces, u, v, width, ~jnp.asarray(problem.real))
+    return feet_at(surface, rows_of(pieces, u, v, width, ~jnp.asarray(problem.real)), u, v)
+
+
+def feet_at(surface: WorkingSurface, rows: Rows, u: Array, v: Array) -> FeetInRows:
+    """With points in known rows, near whose cells the feet (u, v) are."""
+    pieces = jax.tree.map(jnp.asarray, surface.pieces)
     u, v = rows.spread(jnp.stack([u, v]))
     s, t = local_coordinates_of(pieces, rows.cell[:, None], u, v)
     return FeetInRows(rows, u, v, s, t)

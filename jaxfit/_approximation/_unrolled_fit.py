@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array, lax
 
 from jaxfit._approximation._automatic_smoothing import AbstractSmoothing
-from jaxfit._approximation._implicit_fit import EndOfFit, FitInputs, base_net_of, given_feet_of, problem_of
+from jaxfit._approximation._fit_inputs import EndOfFit, FitInputs, base_net_of, given_feet_of, problem_of
 from jaxfit._compile import compiled
 from jaxfit._differentiable_once import differentiable_once
 from jaxfit._fit._loop import LoopState, begin, iterate

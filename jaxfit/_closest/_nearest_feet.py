@@ -25,6 +25,7 @@ def nearest_feet(
     max_steps: int,
     used: tuple[int, int] | None = None,
     chunk: int | None = None,
+    borders: bool = True,
 ) -> HostFeet:
     """Feet of all points: `u`, `v`, `distance`, `converged`, `steps`, and `point` on the surface.
 
@@ -33,7 +34,8 @@ def nearest_feet(
     for. `known` are feet (u, v, distance, converged) found before, with which the search begins; `point` is
     then left out. `tolerance` is a fraction of the extent. Of a net with surplus control points, behind
     repeated end knots, `used` says how many are in use along u and v. `chunk` is how many points are
-    projected at a time; by default that depends on how many there are.
+    projected at a time; by default that depends on how many there are. Feet that do not converge are searched
+    for on the `borders`.
     """
     if chunk is None:
         chunk = chunk_size(len(points) if known is None else min(len(points), CHUNK))
@@ -42,7 +44,8 @@ def nearest_feet(
         best = projector(None, *start)
     else:
         best = _globally(projector, known, used or net.shape[:2])
-    search_borders(projector, best)
+    if borders:
+        search_borders(projector, best)
     with np.errstate(invalid="ignore"):
         best["distance"] = np.sqrt(best.pop("f")) * projector.unit
     if "point" in best:

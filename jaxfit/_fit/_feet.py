@@ -2,13 +2,24 @@
 
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool
 
-from jaxfit._closest import FOOT_STEPS, AbstractFootMethod, ParameterBounds, project, update_feet
+from jaxfit._closest import (
+    FOOT_STEPS,
+    AbstractFootMethod,
+    ParameterBounds,
+    nearest_feet,
+    project,
+    update_feet,
+)
+from jaxfit._closest._chunks import CHUNK, chunk_size
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._problem import Problem
+from jaxfit._fit._working_surface import WorkingSurface
 from jaxfit._splines._pieces import Axis, Pieces
 
 
@@ -27,6 +38,32 @@ def measure_feet(
         *(feet.u, feet.v, feet.error, feet.evaluations, feet.converged, active, jnp.asarray(True)),
         before.summary,
     )
+
+
+def measure_feet_on_host(
+    method: AbstractFootMethod,
+    problem: Problem,
+    surface: WorkingSurface,
+    before: FootPoints,
+    foot_tolerance: float,
+) -> FootPoints:
+    """`measure_feet` where all is concrete, by the programs of `closest_point`."""
+    count = int(np.sum(problem.real))  # the first ones
+    points = np.asarray(problem.target)[:, :count].T
+    start = np.asarray(before.u)[:count], np.asarray(before.v)[:count]
+    net, axes = jax.tree.map(np.asarray, (surface.control_points, surface.axes))
+    found = nearest_feet(
+        *(method, net, *axes, points),
+        start=start,
+        borders=False,
+        tolerance=foot_tolerance,
+        max_steps=FOOT_STEPS,
+        chunk=chunk_size(min(count, CHUNK)),
+    )
+    parts = [np.array(x) for x in (before.u, before.v, before.error, before.converged)]
+    for part, name in zip(parts, ("u", "v", "distance", "converged"), strict=True):
+        part[:count] = found[name]
+    return eqx.tree_at(lambda p: (p.u, p.v, p.error, p.converged), before, tuple(parts))
 
 
 def measure_grid(
