@@ -127,10 +127,10 @@ def derivative_ahead(
         return
     at_rest = polish_ahead(rest, _polish_of(adjoint, end, inputs))
     if differentiated_too:
-        args = rest, _place(at_rest), end, inputs
+        args = rest, _resting(at_rest), end, inputs
         _along_inputs.ahead(*args)
-        fitted, along, places = _along_inputs.like_result(*args)
-        transpose_ahead(_along, (along, places, at_rest.near), inputs, fitted)
+        fitted, along, order = _along_inputs.like_result(*args)
+        transpose_ahead(_along, (along, order, at_rest.near), inputs, fitted)
 
 
 def _at_rest(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> PolishedFit:
@@ -144,26 +144,24 @@ def _polish_of(adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Po
     return Polish(inputs.numbers, goal, most, end.problem, end.surface, end.state, end.projection)
 
 
-class _Place(eqx.Module):
+class _RestingFit(eqx.Module):
     """Where a fit is at rest: what its derivative needs to know of that."""
 
     net: Float[Any, "nu nv d"]
-    u: Float[Any, " points"]
-    v: Float[Any, " points"]
     feet: FeetInRows
     free: Bool[Any, "nu nv"]
     stationarity: Float[Any, ""]
 
 
-def _place(at_rest: PolishedFit) -> _Place:
-    here, near = at_rest.projection, at_rest.near
-    return _Place(at_rest.net, here.u, here.v, near.feet, near.system.free, at_rest.stationarity)
+def _resting(at_rest: PolishedFit) -> _RestingFit:
+    near = at_rest.near
+    return _RestingFit(at_rest.net, near.feet, near.system.free, at_rest.stationarity)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit as a function of the inputs."""
-    return _fitted(rest, _place(at_rest), end, inputs)
+    return _fitted(rest, _resting(at_rest), end, inputs)
 
 
 @partial(_fitted_at_rest.defjvp, symbolic_zeros=True)
@@ -176,84 +174,84 @@ def _fitted_and_change(
     rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs, tangents: Any
 ) -> tuple[Fitted, Fitted]:
     """The polished fit, and its derivative along a change of the inputs."""
-    fitted, along, places = _along_inputs(rest, _place(at_rest), end, differentiated(inputs))
-    known = along, places, at_rest.near
+    fitted, along, order = _along_inputs(rest, _resting(at_rest), end, differentiated(inputs))
+    known = along, order, at_rest.near
     return fitted, linear_call(_along, known, _with_zeros(tangents), fitted)
 
 
 @partial(compiled, kept=True, static_argnums=0)
-def _fitted(rest: Any, place: _Place, end: EndOfFit, inputs: FitInputs) -> Fitted:
+def _fitted(rest: Any, resting: _RestingFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit."""
-    return _residual_at_rest(rest, place, end)(inputs)[1]
+    return _residual_at_rest(rest, resting, end)(inputs)[1]
 
 
 @partial(compiled, optimised=False, static_argnums=0)
 def _along_inputs(
-    rest: Any, place: _Place, end: EndOfFit, inputs: FitInputs
-) -> tuple[Fitted, LinearMap, "_Places"]:
+    rest: Any, resting: _RestingFit, end: EndOfFit, inputs: FitInputs
+) -> tuple[Fitted, LinearMap, "_PointOrder"]:
     """The polished fit; G with the fit as a linear map of changes of the inputs; and where points are."""
-    residual = _residual_at_rest(rest, place, end)
+    residual = _residual_at_rest(rest, resting, end)
     (_, fitted), along = jax.linearize(residual, inputs)
-    return fitted, along, _Places.of(end, place.feet.rows, inputs.points.shape[0])
+    return fitted, along, _PointOrder.of(end, resting.feet.rows, inputs.points.shape[0])
 
 
-def _along(known: tuple[LinearMap, "_Places", Linearisation], change: FitInputs) -> Fitted:
+def _along(known: tuple[LinearMap, "_PointOrder", Linearisation], change: FitInputs) -> Fitted:
     """The derivative along a change of the inputs."""
-    along_inputs, places, near = known
+    along_inputs, order, near = known
     right, held = along_inputs(change)
     accuracy = float(jnp.finfo(right.dtype).eps) ** ACCURACY
     move = near.system.solved_differentiably(near.change, -right, accuracy)
-    count, scale = change.points.shape[0], places.scale
-    u, v, error = (places.by_point(x, count) for x in near.along_net(move)[1])
+    count, scale = change.points.shape[0], order.scale
+    u, v, error = (order.by_point(x, count) for x in near.along_net(move)[1])
     net, none = jnp.where(near.system.free[:, :, None], scale * move, 0.0), jnp.zeros_like(held.diagonal)
     return jax.tree.map(jnp.add, held, Fitted(net, u, v, scale * error, none, none))
 
 
-class _Places(eqx.Module):
+class _PointOrder(eqx.Module):
     """The number of the point in each slot of the rows, and the unit of the fit."""
 
     number: Int[Any, "rows width"]
     scale: Float[Any, ""]
 
     @staticmethod
-    def of(end: EndOfFit, rows: Rows, count: int) -> "_Places":
+    def of(end: EndOfFit, rows: Rows, count: int) -> "_PointOrder":
         """Empty slots have the number `count`."""
         number = jnp.asarray(end.order)[jnp.minimum(rows.point, end.order.shape[0] - 1)]
         scale = jnp.asarray(end.unit.scale, end.problem.target.dtype)
-        return _Places(jnp.where(rows.filled, number, count), scale)
+        return _PointOrder(jnp.where(rows.filled, number, count), scale)
 
     def by_point(self, x: Float[Array, "rows width"], count: int) -> Float[Array, " points"]:
         """In the order of the points as they were given."""
         return jnp.zeros(count, x.dtype).at[self.number].add(x, mode="drop")
 
 
-def _residual_at_rest(rest: Any, place: _Place, end: EndOfFit) -> Residual:
+def _residual_at_rest(rest: Any, resting: _RestingFit, end: EndOfFit) -> Residual:
     """G, and the fit, as functions of the inputs."""
-    place, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (place, end)))
-    surface = end.surface.moved_to(place.net)
+    resting, end = lax.stop_gradient(jax.tree.map(jnp.asarray, (resting, end)))
+    surface = end.surface.moved_to(resting.net)
 
     def residual(inputs: FitInputs) -> tuple[Array, Fitted]:
         method = eqx.combine(inputs.numbers, rest)
         problem, still = problem_of(end, inputs), base_net_of(end, inputs)
-        feet = place.feet
+        feet = resting.feet
         if not method.finds_feet:
             feet = feet_at(surface, feet.rows, *given_feet_of(end, inputs))
-        found = stationarity_residual(method, end.state, surface, problem, feet, place.free, still)
-        return found.value, _outward(end, inputs, place, still, found)
+        found = stationarity_residual(method, end.state, surface, problem, feet, resting.free, still)
+        return found.value, _outward(end, inputs, resting, still, found)
 
     return residual
 
 
 def _outward(
-    end: EndOfFit, inputs: FitInputs, place: _Place, still: Array, found: StationarityResidual
+    end: EndOfFit, inputs: FitInputs, resting: _RestingFit, still: Array, found: StationarityResidual
 ) -> Fitted:
     """In the user's unit and the order of the points."""
     unit, count = end.unit, inputs.points.shape[0]
-    places = _Places.of(end, place.feet.rows, count)
-    moved, kept = (x * unit.scale + unit.centre[None, None] for x in (place.net, still))
+    order = _PointOrder.of(end, resting.feet.rows, count)
+    moved, kept = (x * unit.scale + unit.centre[None, None] for x in (resting.net, still))
     if inputs.control_points.shape == kept.shape:
         kept = inputs.control_points.astype(kept.dtype)  # to the last bit
-    net = jnp.where(place.free[:, :, None], moved, kept)
-    u, v, error = (places.by_point(x, count) for x in (found.u, found.v, found.error))
+    net = jnp.where(resting.free[:, :, None], moved, kept)
+    u, v, error = (order.by_point(x, count) for x in (found.u, found.v, found.error))
     diagonal = problem_of(end, inputs).diagonal * unit.scale
-    return Fitted(net, u, v, error * unit.scale, diagonal, place.stationarity)
+    return Fitted(net, u, v, error * unit.scale, diagonal, resting.stationarity)
