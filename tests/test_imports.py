@@ -14,7 +14,7 @@ ROOMS = [
     ("_interrupt", "_version", "_cores"),
     ("_checks", "_remembered"),
     ("_precision", "_progress_line"),
-    ("_varying", "_differentiable_once"),
+    ("_varying", "_differentiable_once", "_symmetric_solve"),
     ("_kept_programs",),
     ("_compile_ahead",),
     ("_unrolling", "_barrier", "_compile", "_program_folder"),

@@ -12,6 +12,7 @@ from jaxfit._base._douglas_peucker import chord_lengths, densify
 from jaxfit._base._normalised_cloud import cloud_of
 from jaxfit._base._parametric_stretch import area_stretch, link_weights
 from jaxfit._checks import as_points, check_number, eager_where_concrete, is_concrete
+from jaxfit._symmetric_solve import solved_on_diagonal
 
 MOST_NODES = 2000  # added to a side whose vertices lie farther apart than the cloud's points
 NODE_SPACING = 0.7  # nodes of a side are at least so far apart, times their distance from the cloud
@@ -175,7 +176,6 @@ def _spaced(rim: np.ndarray, room: np.ndarray) -> np.ndarray:
 def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "nodes 2"]:
     """Parameters of all nodes with these weights."""
     from scipy.sparse import csr_array, diags_array, eye_array
-    from scipy.sparse.linalg import splu
 
     count, fixed = len(nodes.points), len(nodes.fixed)
     i = np.repeat(np.arange(count), star.filled.sum(axis=1))
@@ -187,10 +187,7 @@ def _solved(nodes: _Nodes, star: Stars, weights: np.ndarray) -> Float[Any, "node
         return nodes.fixed
     free = graph[fixed:]
     system = eye_array(count - fixed) - free[:, fixed:]
-    # An M-matrix needs no pivots off the diagonal, and those would only add fill.
-    options = {"SymmetricMode": True}
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    inner = factors.solve(free[:, :fixed] @ nodes.fixed)
+    inner = solved_on_diagonal(system, free[:, :fixed] @ nodes.fixed)
     return np.concatenate([nodes.fixed, np.clip(inner, 0.0, 1.0)])
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._base._host_splines import Knots, basis_matrix
+from jaxfit._symmetric_solve import solved_on_diagonal
 
 OUTLIER_RATIO = 20.0  # times the median residual: where a point has half its weight
 LEAST_RESIDUAL = 1e-9  # of the diagonal: a residual this small is rounding
@@ -88,7 +89,6 @@ class ThinPlateFit:
     def net(self, weights: Float[Any, " points"], smoothing: float) -> Float[Any, "nu nv d"]:
         """The minimum with these weights."""
         from scipy.sparse import diags_array
-        from scipy.sparse.linalg import splu
 
         nu, nv, d = self._start.shape
         free, held = np.flatnonzero(self._free), np.flatnonzero(~self._free)
@@ -101,8 +101,5 @@ class ThinPlateFit:
         # Where the plate has no bending (order 2) it leaves a control point without points undecided.
         shift = REGULARISATION * self._trace / len(flat)
         inner = system[free][:, free] + shift * diags_array(np.ones(len(free)))
-        # Positive definite: no pivots off the diagonal, whose fill may cost twenty times as much.
-        options = {"SymmetricMode": True}
-        factors = splu(inner.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-        flat[free] = factors.solve(right + shift * flat[free])
+        flat[free] = solved_on_diagonal(inner, right + shift * flat[free])
         return flat.reshape(nu, nv, d)

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit._scan._manifold import Faces
+from jaxfit._symmetric_solve import solved_on_diagonal
 
 LEAST_WEIGHT = 1e-3  # of the mean weight of an edge
 
@@ -21,7 +22,6 @@ def circle_map(
     Source: M. S. Floater, Mean value coordinates, Computer Aided Geometric Design 20 (2003).
     """
     from scipy.sparse import diags_array
-    from scipy.sparse.linalg import splu
 
     places = np.zeros((len(points), 2))
     places[rim] = _on_circle(points[rim])
@@ -29,10 +29,7 @@ def circle_map(
     inner[rim] = False
     weights = _mean_value_weights(points, faces)[inner]
     system = diags_array(np.asarray(weights.sum(axis=1)).ravel()) - weights[:, inner]
-    # An M-matrix needs no pivots off the diagonal, and those would only add fill.
-    options = {"SymmetricMode": True}
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    places[inner] = factors.solve(weights[:, ~inner] @ places[~inner])
+    places[inner] = solved_on_diagonal(system, weights[:, ~inner] @ places[~inner])
     return places
 
 

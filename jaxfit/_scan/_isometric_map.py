@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit._scan._manifold import Faces
+from jaxfit._symmetric_solve import solved_on_diagonal
 
 MOST_STEPS = 50
 ENOUGH = 2e-4  # a step that lowers the energy by less than this share is the last,
@@ -87,7 +88,6 @@ def isometric_maps(
 def _global_step(triangles: Triangles, places: np.ndarray) -> np.ndarray:
     """The places that minimise the quadratic proxy sum A |W (J - R)|^2, R the nearest rotations."""
     from scipy.sparse import block_array, csr_array, eye_array
-    from scipy.sparse.linalg import splu
 
     left, size, right = np.linalg.svd(triangles.jacobians(places))
     rotation = left @ right
@@ -103,14 +103,12 @@ def _global_step(triangles: Triangles, places: np.ndarray) -> np.ndarray:
         return csr_array((values, (rows, columns)), shape=(count, count))
 
     mixed = block(0, 1)
-    system = block_array([[block(0, 0), mixed], [mixed, block(1, 1)]]).tocsc()
+    system = block_array([[block(0, 0), mixed], [mixed, block(1, 1)]])
     hold = PROXIMITY * float(system.diagonal().mean())
     pull = metric @ rotation @ gradients  # (faces, 2, 3)
     load = np.stack([np.bincount(faces.ravel(), pull[:, a].ravel(), count) for a in (0, 1)])
-    options = {"SymmetricMode": True}
-    matrix = (system + hold * eye_array(2 * count)).tocsc()
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return factors.solve(load.ravel() + hold * places.T.ravel()).reshape(2, count).T
+    matrix = system + hold * eye_array(2 * count)
+    return solved_on_diagonal(matrix, load.ravel() + hold * places.T.ravel()).reshape(2, count).T
 
 
 def _first_flip(triangles: Triangles, places: np.ndarray, direction: np.ndarray) -> float:

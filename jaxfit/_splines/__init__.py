@@ -12,7 +12,6 @@ from jaxfit._splines._knots import averaging_knots as averaging_knots
 from jaxfit._splines._knots import clamped_uniform_knots as clamped_uniform_knots
 from jaxfit._splines._knots import greville_abscissae as greville_abscissae
 from jaxfit._splines._knots import merge_knots as merge_knots
-from jaxfit._splines._knots import missing_knots as missing_knots
 from jaxfit._splines._pieces import Pieces as Pieces
 from jaxfit._splines._pieces import make_pieces as make_pieces
 from jaxfit._splines._reflection import Reflection as Reflection

@@ -145,8 +145,8 @@ def greville_abscissae(knots: ArrayLike, order: int) -> Float[Array, " n"]:
 def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) -> Float[Array, " knots"]:
     """Union of two knot vectors, each knot as often as in the vector that has it more often.
 
-    Splines on `a` and on `b` are both splines on the result (section 2.3 of the paper; the knots
-    to insert are those of `missing_knots`). Concrete NumPy work: not for use under `jit`.
+    Splines on `a` and on `b` are both splines on the result (section 2.3 of the paper). Concrete NumPy
+    work: not for use under `jit`.
 
     Parameters
     ----------
@@ -186,21 +186,6 @@ def merge_knots(a: ArrayLike, b: ArrayLike, order: int, tolerance: float = 0.0) 
     values = np.union1d(a, b)
     repeats = np.maximum(*(np.array([np.sum(x == value) for value in values]) for x in (a, b)))
     return jnp.asarray(np.repeat(values, repeats))
-
-
-def missing_knots(knots: ArrayLike, merged: ArrayLike, tolerance: float = 0.0) -> Float[Array, " m"]:
-    """The knots of `merged` that `knots` lacks, repeated as often as they are missing.
-
-    The argument that `insert_knots` needs to reach `merged`; knots within `tolerance` of each
-    other are the same. Concrete NumPy work like `merge_knots`.
-    """
-    if not is_concrete(knots, merged):
-        raise TypeError("missing_knots needs concrete knots, but was traced; call it outside jit.")
-    target = _sorted_values("merged", merged)
-    own = _snapped(_sorted_values("knots", knots), target, tolerance)
-    values = np.unique(target)
-    repeats = np.array([np.sum(target == value) - np.sum(own == value) for value in values])
-    return jnp.asarray(np.repeat(values, np.maximum(repeats, 0)))
 
 
 def _snapped(knots: np.ndarray, onto: np.ndarray, tolerance: float) -> np.ndarray:

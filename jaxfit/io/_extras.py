@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from jaxfit.io._point_data import InputError
+from jaxfit.io._point_data import InputError, one_line
 
 
 def import_extra(module: str, suffix: str, extra: str) -> ModuleType:
@@ -21,7 +21,6 @@ def import_extra(module: str, suffix: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         raise InputError(f"{suffix} files need {package}, which is not installed; {remedy}.") from error
     except (ImportError, OSError) as error:
-        reason = " ".join(str(error).split())
         raise InputError(
-            f"{suffix} files need {package}, which does not load here ({reason}); {remedy} again."
+            f"{suffix} files need {package}, which does not load here ({one_line(error)}); {remedy} again."
         ) from error

@@ -24,6 +24,11 @@ class InputError(ValueError):
     """
 
 
+def one_line(error: Exception) -> str:
+    """What a library has to say, for a sentence of ours."""
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+
+
 @dataclasses.dataclass(frozen=True)
 class PointData:
     """Data points as read from a file: scattered `points`, or a `grid`, never both.

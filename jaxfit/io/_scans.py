@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.io._extras import import_extra
-from jaxfit.io._point_data import InputError
+from jaxfit.io._point_data import InputError, one_line
 
 Counts = dict[str, int]
 Points = Float[np.ndarray, "points 3"]
@@ -41,12 +41,12 @@ def read_scan(path: Path) -> tuple[Points, Counts, Faces | None]:
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or _one_line(error)}.") from error
+        raise InputError(f"{path} cannot be read: {error.strerror or one_line(error)}.") from error
     except MemoryError as error:
         raise InputError(f"{path} holds more than there is memory for; thin the points.") from error
     except Exception as error:  # a parser may raise anything on a damaged file
         raise InputError(
-            f"{path} is no {suffix} file that can be read, or was cut short ({_one_line(error)}); "
+            f"{path} is no {suffix} file that can be read, or was cut short ({one_line(error)}); "
             "write it again."
         ) from error
     return points, {reason: count for reason, count in left_out.items() if count}, faces
@@ -182,10 +182,6 @@ def _check_faces_of_off(path: Path) -> None:
     lines = [line for line in bare.split("OFF", 1)[1].splitlines() if line.strip()]
     vertices, faces = map(int, lines[0].split()[:2])
     _check_count(path, min(len(lines) - 1 - vertices, faces), faces, "faces")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 
 _Reader = Callable[[Path, Any], Found]

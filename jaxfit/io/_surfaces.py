@@ -15,7 +15,7 @@ from jaxfit._trimmed._trimmed_surface import host_loops
 from jaxfit.io._cad import iges_bytes, step_bytes
 from jaxfit.io._nets import clamped_net, near_origin
 from jaxfit.io._output import check_output, write_atomically
-from jaxfit.io._point_data import InputError
+from jaxfit.io._point_data import InputError, one_line
 from jaxfit.io._points import check_input
 from jaxfit.io._rhino import rhino_bytes
 from jaxfit.io._stored import json_bytes, npz_bytes, stored_surface
@@ -165,10 +165,6 @@ def read_surface(path: str | os.PathLike) -> BSplineSurface | TrimmedSurface:
         raise
     except _DAMAGED as error:
         raise InputError(
-            f"{path} holds no B-spline surface that can be read ({_one_line(error)}); write it "
+            f"{path} holds no B-spline surface that can be read ({one_line(error)}); write it "
             "with jaxfit.io.write_surface."
         ) from error
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
