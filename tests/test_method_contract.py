@@ -1,6 +1,7 @@
 """A new method of approximation, written from public names alone, runs wherever the library's own do."""
 
 import re
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,13 +23,13 @@ class HeavyBall(jf.AbstractIterativeMethod):
     finds_feet = True
 
     class State(eqx.Module):
-        sums: jax.Array
+        sums: Any
         velocity: jax.Array
 
     def init(self, problem, surface, projection):
         net = surface.control_points
         still = np.zeros_like(net) if isinstance(net, np.ndarray) else jnp.zeros_like(net)
-        return surface, self.State(still, still)
+        return surface, self.State(jf.ControlPointSums().zeros(net), still)
 
     def measure(self, problem, iterate, exact):
         before = iterate.projection
@@ -46,7 +47,7 @@ class HeavyBall(jf.AbstractIterativeMethod):
         active = jnp.sum(problem.counted, dtype=jnp.int32)
         parts = feet.u, feet.v, feet.error, feet.evaluations, feet.converged
         here = jf.FootPoints(*parts, active, jnp.asarray(True))
-        return here, self.State(found.means, iterate.state.velocity)
+        return here, self.State(found, iterate.state.velocity)
 
     def accept(self, problem, old, new):
         return new
@@ -54,7 +55,7 @@ class HeavyBall(jf.AbstractIterativeMethod):
     def move(self, problem, iterate, history):
         surface, state = iterate.surface, iterate.state
         risen = history.has_risen(iterate.step)
-        velocity = jnp.where(risen, 0.0, self.momentum * state.velocity) + state.sums
+        velocity = jnp.where(risen, 0.0, self.momentum * state.velocity) + state.sums.means
         held = jf.held_points(jf.FixedBorder(), velocity.shape, surface.used)
         velocity = jnp.where(held[..., None], 0.0, velocity)
         surface = surface.moved_to(surface.control_points + velocity)

@@ -26,7 +26,8 @@ from jaxfit._closest import closest_point, neighbours_together
 from jaxfit._fit._adjoints import ImplicitAdjoint, UnrolledAdjoint
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, check_derivative, run
-from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields, static_fields
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method_fields import dynamic_fields, static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, Name, converged_or_raise

@@ -5,31 +5,37 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
 from jaxfit._barrier import materialise
 from jaxfit._cells import Rows, cells_to_net, row_moments
+from jaxfit._checks import is_concrete
 from jaxfit._closest import PointSums, dot
 from jaxfit._splines._pieces import Pieces
 from jaxfit._unrolling import root
 
 
 class WeightedErrors(eqx.Module):
-    """sum_k w_k N_i N_j e_k and, last, sum_k w_k N_i N_j for every control point."""
+    """sum_k w_k N_i N_j e_k, e_k = Q_k - R, and, last, sum_k w_k N_i N_j for every control point."""
 
     sums: Float[Any, "nu nv c"]
 
     @property
     def means(self) -> Float[Array, "nu nv d"]:
-        """Weighted means of the error vectors around each control point, 0 where no point has influence."""
+        """Weighted means of the residuals e_k around each control point, 0 where no point has influence."""
         total = self.sums[..., -1:]
         touched = total > 0
         return jnp.where(touched, self.sums[..., :-1] / jnp.where(touched, total, 1.0), 0.0)
 
 
 class ControlPointSums(PointSums):
-    """The sums `WeightedErrors` over all points, accumulated while feet are updated.
+    r"""Sums over all points for each control point, accumulated while feet are updated.
+
+    `update_feet` gives an object with `means` (nu, nv, d), the weighted means of the residuals
+    $e_k = Q_k - R(u_k, v_k)$: $\sum_k w_k N_i N_j e_k / \sum_k w_k N_i N_j$, 0 where no point has influence.
+    Kept as `sums` of a state it is added up over devices. A state begins with `zeros`.
 
     Parameters
     ----------
@@ -44,16 +50,21 @@ class ControlPointSums(PointSums):
 
     Examples
     --------
-    >>> jf.ControlPointSums().weigh is None
-    True
+    >>> jf.ControlPointSums().zeros(np.ones((5, 4, 3))).means.shape
+    (5, 4, 3)
     >>> jf.ControlPointSums(lambda weight, error: weight / (1 + error)).weigh(1.0, 3.0)
     0.25
     """
 
     weigh: Callable[[Array, Array], Array] | None = None
 
+    def zeros(self, net: Float[Any, "nu nv d"]) -> WeightedErrors:
+        """What there is for no points, for a net of this shape: `sums` of a first state."""
+        xp: Any = np if is_concrete(net) else jnp
+        return WeightedErrors(xp.zeros((*net.shape[:2], net.shape[2] + 1), net.dtype))
+
     def begin(self, pieces: Pieces) -> Float[Array, "cells K Lc"]:
-        """Zeros."""
+        """Zeros for each cell."""
         cells, d, order_u, order_v = pieces.coefficients.shape
         return jnp.zeros((cells, order_u, order_v * (d + 1)), pieces.coefficients.dtype)
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from jaxfit._checks import is_concrete
 from jaxfit._closest import as_feet
 from jaxfit._fit._foot_points import FootPoints
-from jaxfit._fit._method import dynamic_fields
+from jaxfit._fit._method_fields import dynamic_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._scaling import Unit
 from jaxfit._fit._working_surface import WorkingSurface

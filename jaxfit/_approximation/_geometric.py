@@ -21,7 +21,8 @@ from jaxfit._closest import AbstractFootMethod, FootUpdate, HuWallner, Newton, u
 from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_points
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method_fields import check_common_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
@@ -142,7 +143,7 @@ class GeometricApproximation(AbstractIterativeMethod):
         for name, kind in (("fairing", Fairing), ("acceleration", Nesterov)):
             check_kind(name, getattr(self, name), kind | None, f"{kind.__name__}()")
         check_border(self.border)
-        check_method(self)
+        check_common_fields(self)
         check_switches(self, ("single_step", "local"))
         check_number("relaxation", self.relaxation, 0.0)
         most, such = (2, "") if self.acceleration is None else (LARGEST_RELAXATION, " accelerated")

@@ -42,7 +42,8 @@ from jaxfit._fit._border import AbstractBorder, FixedBorder, FreeBorder, check_b
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method_fields import check_common_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
@@ -185,7 +186,7 @@ class OrthogonalDistance(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_border(self.border)
-        check_method(self)
+        check_common_fields(self)
         check_number("damping", self.damping, 0.0)
         if is_concrete(self.damping) and not 0 < self.damping <= 1:
             raise ValueError(

@@ -10,7 +10,8 @@ from jaxfit._closest import Newton, compile_search_ahead
 from jaxfit._compile_ahead import is_first
 from jaxfit._fit._adjoints import UnrolledAdjoint
 from jaxfit._fit._loop import compile_ahead
-from jaxfit._fit._method import AbstractIterativeMethod, static_fields
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method_fields import static_fields
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._scaling import unit_of
 from jaxfit._fit._working_surface import WorkingSurface, plane

@@ -39,7 +39,8 @@ from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._fit._history import ErrorHistory, public_history
 from jaxfit._fit._loop import begin, iterate
-from jaxfit._fit._method import AbstractIterativeMethod, static_and_numbers
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method_fields import static_and_numbers
 from jaxfit._fit._problem import MeshAxis, Tolerances, make_problem
 from jaxfit._fit._reasons import result_of
 from jaxfit._fit._result import Fit, converged_or_raise

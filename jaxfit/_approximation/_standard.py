@@ -25,7 +25,8 @@ from jaxfit._fit._border import AbstractBorder, FixedBorder, check_border, held_
 from jaxfit._fit._feet import measure_feet
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method_fields import check_common_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
@@ -117,7 +118,7 @@ class StandardApproximation(AbstractIterativeMethod):
         check_loss(self.loss)
         check_insertion(self.insertion)
         check_border(self.border)
-        check_method(self)
+        check_common_fields(self)
         check_switches(self, ("parameter_correction",))
 
     @property

@@ -15,7 +15,8 @@ from jaxfit._approximation._fit_inputs import EndOfFit, FitInputs, base_net_of, 
 from jaxfit._compile import compiled
 from jaxfit._differentiable_once import differentiable_once
 from jaxfit._fit._loop import LoopState, begin, iterate
-from jaxfit._fit._method import AbstractIterativeMethod, dynamic_fields
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method_fields import dynamic_fields
 from jaxfit._fit._scaling import Unit
 from jaxfit._splines import BSplineSurface
 from jaxfit._unrolling import unrolling

@@ -55,7 +55,8 @@ def update_feet(
     u, v : array (points,)
         Where the search begins.
     tolerance : array ()
-        The largest tangential part of a residual, a length.
+        The largest tangential part of a residual, a length. Rounding is allowed for, so 1e-12 times
+        `problem.diagonal` suits both precisions.
     idle : array (points,) of bool
         Points that stay where they are and take no part.
     max_steps : int

@@ -63,7 +63,7 @@ class ErrorHistory(eqx.Module):
         return ErrorHistory(self.errors.at[:, at].set(entry), self.counts.at[:, at].set(counts), first)
 
     def at(self, step: Array) -> Float[Array, "4"]:
-        """The errors of an iteration."""
+        """Average, maximum, evaluations and change of an iteration; `iterate.step` is the last one."""
         return self.errors[:, step % self.capacity]
 
     def has_risen(self, step: Array) -> Array:

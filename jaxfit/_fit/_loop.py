@@ -21,7 +21,8 @@ from jaxfit._checks import is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, static_and_numbers
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method_fields import static_and_numbers
 from jaxfit._fit._problem import Problem, summary_of
 from jaxfit._fit._reasons import RESULTS, code_of
 from jaxfit._fit._working_surface import WorkingSurface

@@ -4,19 +4,15 @@ from abc import abstractmethod
 from typing import Any
 
 import equinox as eqx
-import jax
-import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxfit._checks import Scalar, check_kind, check_number, is_concrete
-from jaxfit._closest import AbstractFootMethod
+from jaxfit._checks import Scalar
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._stationarity_condition import StationarityCondition
 from jaxfit._fit._working_surface import WorkingSurface
-from jaxfit._precision import working_dtype
 
 
 class Iterate(eqx.Module):
@@ -78,8 +74,8 @@ class AbstractIterativeMethod(eqx.Module):
     Attributes
     ----------
     stall_window, stall_gain : int, float
-        Fields that a method must have. The fit stops as stalled when neither error has fallen by the share
-        `stall_gain` within `stall_window` iterations.
+        Fields that a method must have, by custom 20 to 40 iterations and 1e-3 to 1e-2. The fit stops as
+        stalled when neither error has fallen by the share `stall_gain` within `stall_window` iterations.
 
     Examples
     --------
@@ -138,8 +134,8 @@ class AbstractIterativeMethod(eqx.Module):
     def move(self, problem: Problem, iterate: Iterate, history: ErrorHistory) -> tuple[Iterate, ErrorHistory]:
         """The next iterate: another surface, `iterate.projection`, the next state, and `iterate.step + 1`.
 
-        `history` ends with the errors of `iterate`, and is returned as it is. Only a method that makes
-        several steps in one move records their errors itself, by `history.append`.
+        `history` ends with the errors of `iterate`, `history.at(iterate.step)`, and is returned as it is.
+        Only a method that makes several steps in one move records their errors itself, by `history.append`.
         """
 
     @abstractmethod
@@ -148,7 +144,8 @@ class AbstractIterativeMethod(eqx.Module):
     ) -> tuple[Iterate, dict[str, Any]]:
         """The iterate to return, usually `iterate` itself, and the method's entries of the fit's `stats`.
 
-        `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate may be better.
+        `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate, if the state holds
+        one with its projection, may be better.
         """
 
     def stationarity(
@@ -166,27 +163,3 @@ class AbstractIterativeMethod(eqx.Module):
             f"a fit by {type(self).__name__} has no derivative, since it names no condition that its final "
             "surface meets; give it a function `stationarity`, or pass adjoint=UnrolledAdjoint()."
         )
-
-
-def dynamic_fields(method: AbstractIterativeMethod) -> tuple[Any, Any]:
-    """The fields that are traced numbers, and the others (`equinox.partition`)."""
-    return eqx.partition(method, lambda x: isinstance(x, float | np.ndarray | jax.Array))
-
-
-def static_fields(method: AbstractIterativeMethod) -> Any:
-    """The fields that are no traced numbers: a program's, hashable."""
-    return dynamic_fields(method)[1]
-
-
-def static_and_numbers(method: AbstractIterativeMethod) -> tuple[Any, Any]:
-    """The static fields of a method, and its numbers as arrays where they are known: what programs take."""
-    numbers, rest = dynamic_fields(method)
-    return rest, jax.tree.map(lambda x: np.asarray(x, working_dtype()) if is_concrete(x) else x, numbers)
-
-
-def check_method(method: Any) -> None:
-    """Raise unless the fields that the methods of this library have in common are valid."""
-    check_number("stall_window", method.stall_window, 1, whole=True)
-    check_number("stall_gain", method.stall_gain, 0.0)
-    check_number("foot_tolerance", method.foot_tolerance, 0.0)
-    check_kind("foot_method", method.foot_method, AbstractFootMethod, "Newton()")

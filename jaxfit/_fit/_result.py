@@ -42,7 +42,7 @@ class Fit(eqx.Module):
     average_error, maximum_error : float arrays ()
         Of `errors`.
     history : History
-        Errors, evaluations and parameter changes of every iteration.
+        Of every iteration: `average`, `maximum`, evaluations and parameter changes.
     result : item of RESULTS
         Why the fit stopped; `converged` and `message` give it as a boolean and as a sentence. A fit may meet
         its tolerances with a surface that folds; the sentence then says so.

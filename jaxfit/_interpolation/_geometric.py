@@ -17,7 +17,8 @@ from jaxfit._fit._border import corners
 from jaxfit._fit._feet import measure_grid, side_bounds
 from jaxfit._fit._foot_points import FootPoints
 from jaxfit._fit._history import ErrorHistory
-from jaxfit._fit._method import AbstractIterativeMethod, Iterate, check_method
+from jaxfit._fit._method import AbstractIterativeMethod, Iterate
+from jaxfit._fit._method_fields import check_common_fields
 from jaxfit._fit._problem import Problem
 from jaxfit._fit._result import Fit
 from jaxfit._fit._working_surface import WorkingSurface
@@ -172,7 +173,7 @@ class GeometricInterpolation(AbstractIterativeMethod, AbstractInterpolation):
             ("adjoint", AbstractAdjoint, "UnrolledAdjoint()"),
         ):
             check_kind(name, getattr(self, name), kind, example)
-        check_method(self)
+        check_common_fields(self)
         check_switches(self, ("local", "keep_borders", "per_point", "solve_stalled"))
         if self.freeze_after is not None:
             check_number("freeze_after", self.freeze_after, 0, whole=True)

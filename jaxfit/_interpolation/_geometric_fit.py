@@ -15,7 +15,7 @@ from jaxfit._compile import compiled
 from jaxfit._compile_ahead import is_first
 from jaxfit._fit._adjoints import ImplicitAdjoint
 from jaxfit._fit._loop import LoopState, begin, compile_ahead, run
-from jaxfit._fit._method import static_fields
+from jaxfit._fit._method_fields import static_fields
 from jaxfit._fit._problem import Problem, Tolerances
 from jaxfit._fit._working_surface import WorkingSurface, plane
 from jaxfit._interpolation._foot_replay import FitInputs, Fitted, attach_derivative

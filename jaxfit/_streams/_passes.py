@@ -16,7 +16,8 @@ from jaxfit._closest import closest_point
 from jaxfit._compile import compiled
 from jaxfit._cores import cores
 from jaxfit._fit._foot_points import FootPoints
-from jaxfit._fit._method import Iterate, static_and_numbers
+from jaxfit._fit._method import Iterate
+from jaxfit._fit._method_fields import static_and_numbers
 from jaxfit._fit._problem import Problem, Tolerances, make_problem
 from jaxfit._fit._scaling import Unit
 from jaxfit._precision import bucket, working_dtype

@@ -23,7 +23,8 @@ from jaxfit._checks import as_floating, check_kind, check_number, is_concrete
 from jaxfit._compile import compiled
 from jaxfit._fit._history import public_history
 from jaxfit._fit._loop import LoopState, begin, record_and_move
-from jaxfit._fit._method import AbstractIterativeMethod, static_and_numbers
+from jaxfit._fit._method import AbstractIterativeMethod
+from jaxfit._fit._method_fields import static_and_numbers
 from jaxfit._fit._problem import Problem, make_problem, summary_of
 from jaxfit._fit._reasons import RESULTS, code_of, result_of
 from jaxfit._fit._result import Fit, converged_or_raise
