@@ -57,18 +57,19 @@ class AbstractIterativeMethod(eqx.Module):
                  iterate, history = move(problem, iterate, history)
         iterate, stats = postprocess(problem, iterate, stopped_early)
 
-    All six functions are called by the loop only. Lengths are in the unit of the problem, in which the
+    These five functions are called by the loop only. Lengths are in the unit of the problem, in which the
     diagonal of the data is about 1, and errors in the history are fractions of that diagonal. Points are
     padded, and those of weight 0 must not influence the surface.
 
     The state is any pytree of arrays whose structure, shapes and dtypes do not change. What a method
     remembers from one function to the next has to be in it. The loop uses none of it but an attribute `sums`,
     if there is one: after `measure` it adds these up over the devices among which the points are divided.
-    Outside transformations `init` is called with NumPy arrays; the other functions are always traced, so they
-    use `jnp.where` and `lax.cond` instead of `if`.
+    Outside transformations `init` is called with NumPy arrays, and its state had better hold NumPy's, which
+    compile nothing; the other functions are always traced, so they use `jnp.where` and `lax.cond` instead of
+    `if`.
 
     A method is an `equinox.Module`, and its fields are its options. Fields that are Python floats are traced,
-    so that another value compiles nothing; all other fields are static and must be hashable. The
+    so that another value compiles nothing; all others, such as a border, are static and must be hashable. The
     properties below may be plain class attributes, as in `stall_since = 0`.
 
     Attributes
@@ -120,7 +121,8 @@ class AbstractIterativeMethod(eqx.Module):
         """The projection of the points onto the iterate's surface, and the next state.
 
         Start from `iterate.projection`, the feet on the surface before. Where `exact` (traced) holds, feet
-        must have converged; otherwise errors may be predictions, if `FootPoints.exact` says so.
+        must have converged, as those of `update_feet` have by default; otherwise errors may be predictions,
+        if `FootPoints.exact` says so.
         """
 
     @abstractmethod
@@ -144,8 +146,8 @@ class AbstractIterativeMethod(eqx.Module):
     ) -> tuple[Iterate, dict[str, Any]]:
         """The iterate to return, usually `iterate` itself, and the method's entries of the fit's `stats`.
 
-        `stopped_early` is True if the fit stalled or diverged, so that an earlier iterate, if the state holds
-        one with its projection, may be better.
+        `stopped_early` is True if the fit stalled or diverged (not at `max_steps`), so that an earlier
+        iterate, if the state holds one with its projection, may be better.
         """
 
     def stationarity(
