@@ -36,7 +36,7 @@ def _never(x: Any) -> Any:
 @_never.defjvp
 def _second(primals: Any, tangents: Any) -> Any:
     raise TypeError(
-        "a fit whose feet move is differentiable once only; take differences of gradients, or hold the feet: "
-        "StandardApproximation(parameter_correction=False) with UnrolledAdjoint() has a second derivative, "
-        "and so has StandardInterpolation()."
+        "this fit is differentiable once only, since its feet move or its derivative is that of "
+        "ImplicitAdjoint(); take differences of gradients. StandardInterpolation() has a second derivative, "
+        "and so has StandardApproximation(parameter_correction=False) with UnrolledAdjoint()."
     )

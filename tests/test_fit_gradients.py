@@ -188,6 +188,13 @@ def test_a_derivative_far_from_rest_is_refused(method):
 
 
 @pytest.mark.slow
+def test_within_jit_a_derivative_far_from_rest_is_no_number():
+    adjoint = jf.ImplicitAdjoint(polish_steps=0)
+    slope = jax.jit(lambda x: jax.grad(height_of)(x, WEIGHTS, adjoint, max_steps=1))
+    assert np.isnan(slope(jnp.asarray(POINTS))).all()
+
+
+@pytest.mark.slow
 def test_a_derivative_not_quite_at_rest_comes_with_a_warning():
     slope = partial(jax.grad(height_of), POINTS, WEIGHTS, max_steps=5)
     with pytest.warns(UserWarning, match=r"may be far off: .* \(stationarity 1.8e-04, more than 1e-06\)"):

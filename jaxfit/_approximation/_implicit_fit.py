@@ -76,7 +76,7 @@ def _derivative(rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
     _, end, inputs = primals
     at_rest = _at_rest(rest, adjoint, end, inputs)
     _check_at_rest(adjoint, at_rest.stationarity)
-    return _fitted_and_change(rest, at_rest, end, inputs, tangents[2])
+    return _fitted_and_change(rest, adjoint, at_rest, end, inputs, tangents[2])
 
 
 def _with_zeros(tangents: Any) -> Any:
@@ -86,18 +86,19 @@ def _with_zeros(tangents: Any) -> Any:
 
 
 def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
-    """Raise where the derivative would be that of no surface, warn where it is inaccurate; within `jit` the
-    number is all there is.
+    """Raise where the derivative would be that of no surface, warn where it is inaccurate; within `jit` it is
+    NaN there.
     """
     if not is_concrete(stationarity):
         return
-    found, good = float(np.max(np.asarray(stationarity))), adjoint.good(np.asarray(stationarity).dtype)
-    if not found <= max(TRUSTED, good):
+    found, dtype = float(np.max(np.asarray(stationarity))), np.asarray(stationarity).dtype
+    good, most = adjoint.good(dtype), _trusted(adjoint, dtype)
+    if not found <= most:
         raise ArithmeticError(
             f"the fit has no derivative here: after up to {adjoint.polish_steps} Newton steps its surface is "
-            f"not at rest (stationarity {found:.1e}, more than {max(TRUSTED, good):.0e}); fit by "
-            "OrthogonalDistance with a number as smoothing, take fewer control points, or pass "
-            "ImplicitAdjoint(polish_steps=...) with more steps or UnrolledAdjoint()."
+            f"not at rest (stationarity {found:.1e}, more than {most:.0e}); fit by "
+            "OrthogonalDistance with a number as smoothing, or a greater one, raise max_steps, take fewer "
+            "control points, or pass ImplicitAdjoint(polish_steps=...) with more steps or UnrolledAdjoint()."
         )
     if found > max(RELIABLE, good):
         warnings.warn(
@@ -108,12 +109,16 @@ def _check_at_rest(adjoint: ImplicitAdjoint, stationarity: Any) -> None:
         )
 
 
+def _trusted(adjoint: ImplicitAdjoint, dtype: Any) -> float:
+    return max(TRUSTED, adjoint.good(dtype))
+
+
 def polished_fitted(rest: Any, adjoint: ImplicitAdjoint, end: EndOfFit, inputs: FitInputs) -> Fitted:
     """The polished fit, with its derivative in the inputs."""
     at_rest = _at_rest(rest, adjoint, end, inputs)
     if not is_concrete(inputs):
         _check_at_rest(adjoint, at_rest.stationarity)
-    return _fitted_at_rest(rest, at_rest, end, inputs)
+    return _fitted_at_rest(rest, adjoint, at_rest, end, inputs)
 
 
 def derivative_ahead(
@@ -158,25 +163,38 @@ def _resting(at_rest: PolishedFit) -> _RestingFit:
     return _RestingFit(at_rest.net, near.feet, near.system.free, at_rest.stationarity)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _fitted_at_rest(rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs) -> Fitted:
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _fitted_at_rest(
+    rest: Any, adjoint: ImplicitAdjoint, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs
+) -> Fitted:
     """The polished fit as a function of the inputs."""
     return _fitted(rest, _resting(at_rest), end, inputs)
 
 
 @partial(_fitted_at_rest.defjvp, symbolic_zeros=True)
-def _derivative_at_rest(rest: Any, primals: Any, tangents: Any) -> tuple[Fitted, Fitted]:
+def _derivative_at_rest(
+    rest: Any, adjoint: ImplicitAdjoint, primals: Any, tangents: Any
+) -> tuple[Fitted, Fitted]:
     at_rest, end, inputs = primals
-    return _fitted_and_change(rest, at_rest, end, inputs, tangents[2])
+    return _fitted_and_change(rest, adjoint, at_rest, end, inputs, tangents[2])
 
 
 def _fitted_and_change(
-    rest: Any, at_rest: PolishedFit, end: EndOfFit, inputs: FitInputs, tangents: Any
+    rest: Any,
+    adjoint: ImplicitAdjoint,
+    at_rest: PolishedFit,
+    end: EndOfFit,
+    inputs: FitInputs,
+    tangents: Any,
 ) -> tuple[Fitted, Fitted]:
-    """The polished fit, and its derivative along a change of the inputs."""
+    """The polished fit, and its derivative along a change of the inputs; NaN within `jit` if not at rest."""
     fitted, along, order = _along_inputs(rest, _resting(at_rest), end, differentiated(inputs))
-    known = along, order, at_rest.near
-    return fitted, linear_call(_along, known, _with_zeros(tangents), fitted)
+    change = linear_call(_along, (along, order, at_rest.near), _with_zeros(tangents), fitted)
+    share = at_rest.stationarity
+    if not is_concrete(share):  # otherwise that has been checked
+        factor = jnp.where(share <= _trusted(adjoint, share.dtype), 1.0, jnp.nan).astype(share.dtype)
+        change = jax.tree.map(lambda x: factor * x, change)  # NaN in both modes
+    return fitted, change
 
 
 @partial(compiled, kept=True, static_argnums=0)

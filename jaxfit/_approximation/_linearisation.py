@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfit._approximation._stationarity_residual import FeetInRows, feet_in_rows, stationarity_residual
 from jaxfit._approximation._stationarity_system import StationaritySystem, stationarity_system
@@ -47,11 +47,11 @@ def linearisation(
     here: FootPoints,
     shift: Float[Array, ""],
     free: Bool[Array, "nu nv"],
-    begun: Bool[Array, ""],
+    steps: Int[Array, ""],
 ) -> Linearisation:
     """At `net`, whose feet are `here`; control points that are not free stay where `surface` has them.
 
-    `rest` and `numbers` are the method. What is free is found out at first, and remains so once `begun`.
+    `rest` and `numbers` are the method. What is free is found out before the first step and remains so.
     """
     problem, surface, state, here = jax.tree.map(jnp.asarray, (problem, surface, state, here))
     method, there = eqx.combine(numbers, rest), surface.moved_to(net)
@@ -60,7 +60,7 @@ def linearisation(
         error = distances_at(there.pieces, *places, problem.target, problem.real)
     feet = feet_in_rows(there, problem, *places)
     system = stationarity_system(method, state, there, problem, feet.rows, places, error, shift)
-    free = jnp.where(begun, free, system.free)
+    free = jnp.where(steps > 0, free, system.free)
 
     def residual(net: Array) -> tuple[tuple[Array, Moved], tuple[Array, Array]]:
         moved = surface.moved_to(net)

@@ -66,22 +66,19 @@ class _Accepted(eqx.Module):
     projection: FootPoints
     value: Float[Any, "nu nv d"]  # G
     size: Float[Any, ""]  # its norm
-    terms: Float[Any, ""]
-    goal: Float[Any, ""]
+    stationarity: Float[Any, ""]  # that over the norms of its terms
 
 
 class _State(eqx.Module):
     """The last accepted net; the next one to try, or that one again after a rejection (`again`)."""
 
     accepted: _Accepted
-    stationarity: Float[Any, ""]  # there
     free: Bool[Any, "nu nv"]
     trial: Float[Any, "nu nv d"]
     predicted: Float[Any, ""]
     shift: Float[Any, ""]
     steps: Int[Any, ""]
     again: Bool[Any, ""]
-    begun: Bool[Any, ""]
     done: Bool[Any, ""]
 
 
@@ -102,7 +99,7 @@ def polished(rest: Any, polish: Polish) -> PolishedFit:
         last, system = _at_rest_in_program(rest, polish)
         near = eqx.tree_at(lambda x: x.system, _near(rest, polish, last), system)
     end = last.accepted
-    return PolishedFit(end.net, end.projection, near, last.stationarity)
+    return PolishedFit(end.net, end.projection, near, end.stationarity)
 
 
 def polish_ahead(rest: Any, polish: Polish) -> PolishedFit:
@@ -145,9 +142,9 @@ def _first_state(polish: Polish) -> _State:
     net = polish.surface.control_points
     xp: Any = np if is_concrete(polish) else jnp  # NumPy's arrays cost no calls of their own
     zero, yes = xp.zeros((), net.dtype), xp.ones((), bool)
-    begin = _Accepted(net, polish.projection, xp.zeros_like(net), zero + xp.inf, zero, zero)
+    begin = _Accepted(net, polish.projection, xp.zeros_like(net), zero + xp.inf, zero + xp.inf)
     free = xp.ones(net.shape[:2], bool)
-    return _State(begin, zero, free, net, zero, zero, xp.zeros((), np.int32), yes, ~yes, ~yes)
+    return _State(begin, free, net, zero, zero, xp.zeros((), np.int32), yes, ~yes)
 
 
 def _step(rest: Any, polish: Polish, now: _State) -> tuple[_State, Linearisation]:
@@ -170,7 +167,7 @@ def _finds_feet(rest: Any, polish: Polish) -> bool:
 def _at_trial(rest: Any, polish: Polish, now: _State, here: FootPoints) -> tuple[Any, ...]:
     """The arguments of `linearisation` at the next net to try, whose feet are `here`."""
     fit = polish.numbers, polish.problem, polish.surface, polish.state
-    return rest, *fit, now.trial, here, now.shift, now.free, now.begun
+    return rest, *fit, now.trial, here, now.shift, now.free, now.steps
 
 
 def _near(rest: Any, polish: Polish, last: _State) -> Linearisation:
@@ -187,7 +184,8 @@ def _advanced(
     """Whether the trial is accepted, and from the net that is, the next one to try."""
     old, value = now.accepted, near.value
     least = jnp.maximum(goal * near.terms, near.rounding)
-    new = _Accepted(now.trial, here, value, jnp.sqrt(jnp.sum(value**2)), near.terms, least)
+    size = jnp.sqrt(jnp.sum(value**2))
+    new = _Accepted(now.trial, here, value, size, size / jnp.where(near.terms > 0, near.terms, 1.0))
     work = 0.5 * jnp.sum((old.value + value) * (now.trial - old.net))
     good = now.again | (new.size <= least) | ((work < 0) & (new.size < GROWTH * old.size))
     shift = _next_shift(now, work, good, new.size / jnp.maximum(old.size, least))
@@ -202,11 +200,9 @@ def _advanced(
     done = good & ((new.size <= least) | (now.steps >= most))
     trial, predicted = lax.cond(good & ~done, step, lambda: (old.net, jnp.zeros_like(work)))
     new = jax.tree.map(lambda x, y: jnp.where(good, x, y), new, old)
-    far = (now.steps >= jnp.maximum(PATIENCE, most // 10)) & (new.size > FAR * new.terms)
+    far = (now.steps >= jnp.maximum(PATIENCE, most // 10)) & (new.stationarity > FAR)
     ended = done | (shift > MOST_SHIFT) | far
-    yes, free = jnp.asarray(True), near.system.free
-    share = new.size / jnp.where(new.terms > 0, new.terms, 1.0)
-    return _State(new, share, free, trial, predicted, shift, now.steps + good, ~good, yes, ended)
+    return _State(new, near.system.free, trial, predicted, shift, now.steps + good, ~good, ended)
 
 
 def _next_shift(now: _State, work: Array, good: Array, fall: Array) -> Array:

@@ -96,7 +96,7 @@ class ImplicitAdjoint(AbstractAdjoint):
     is passed to, returns the polished surface. Its `stats["stationarity"]` is |G| over the sum of the norms
     of the terms of G. Read it: above 1e-6 the surface could not be polished, and the derivative is not to be
     trusted; differentiating outside `jit` then warns, and above 1e-3 raises an ArithmeticError. Inside `jit`
-    it may give NaN there.
+    the derivative is NaN there.
 
     A lambda that `GeneralizedCrossValidation` or `Discrepancy` has chosen counts as a constant: differences
     of fits also hold what its choice changes.
